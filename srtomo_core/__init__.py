@@ -1,0 +1,1 @@
+"""What the halves of srtomo agree on: instrument, layout, reconstructor, wire and bags. Imports no ROS."""

@@ -1,0 +1,113 @@
+"""Fixtures of the node tests: a ROS domain of their own, and real processes that are always ended."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from pathlib import Path
+
+import pytest
+
+NEEDS_ROS = "needs rclpy: install srtomo with its extra, pip install '.[ros]', or source ROS 2 Jazzy"
+
+
+class NodeProcess:
+    """A Python process that was started by a test; what it prints goes to a file."""
+
+    def __init__(self, arguments: tuple[str, ...], log: Path) -> None:
+        self._log = log
+        with log.open("wb") as output:
+            self._process = subprocess.Popen(
+                [sys.executable, *arguments],
+                cwd=log.parent,
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                env={**os.environ, "PYTHONUNBUFFERED": "1", "OPENBLAS_NUM_THREADS": "1"},
+            )
+
+    @property
+    def pid(self) -> int:
+        """The process's id: the wheels of rclpy start Python twice, but in one process."""
+        return self._process.pid
+
+    @property
+    def output(self) -> str:
+        """What it printed so far, errors included."""
+        return self._log.read_text(encoding="utf-8", errors="replace")
+
+    def wait_for(self, text: str, timeout: float = 30.0) -> None:
+        """Wait until it has printed a text."""
+        deadline = time.monotonic() + timeout
+        while text not in self.output:
+            ended = self._process.poll()
+            assert ended is None, f"ended with {ended} before it printed {text!r}:\n{self.output}"
+            assert time.monotonic() < deadline, f"no {text!r} within {timeout} s:\n{self.output}"
+            time.sleep(0.02)
+
+    def wait(self, timeout: float = 30.0) -> int:
+        """Wait until it ends; returns its exit status."""
+        return self._process.wait(timeout)
+
+    def interrupt(self, timeout: float = 30.0) -> int:
+        """As Ctrl-C does; returns its exit status."""
+        self._process.send_signal(signal.SIGINT)
+        return self.wait(timeout)
+
+    def kill(self) -> None:
+        """kill -9."""
+        self._process.kill()
+        self._process.wait()
+
+    def end(self) -> None:
+        """End it, politely first."""
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGKILL):
+            if self._process.poll() is not None:
+                return
+            self._process.send_signal(number)
+            with suppress(subprocess.TimeoutExpired):
+                self._process.wait(5.0)
+
+
+StartProcess = Callable[..., NodeProcess]
+
+
+@pytest.fixture(scope="session")
+def _clean_shared_memory() -> Iterator[None]:
+    """What killed processes left in /dev/shm; segments in use stay."""
+    yield
+    if tool := shutil.which("fastdds", path=f"{Path(sys.executable).parent}{os.pathsep}{os.environ.get('PATH', '')}"):
+        subprocess.run([tool, "shm", "clean"], capture_output=True, timeout=30, check=False)
+
+
+@pytest.fixture
+def ros_domain(monkeypatch: pytest.MonkeyPatch, _clean_shared_memory: None) -> Iterator[int]:
+    """A free ROS domain on this host alone, in the environment of this process and those that it starts."""
+    pytest.importorskip("rclpy", reason=NEEDS_ROS)
+    from domain_coordinator import domain_id
+
+    with domain_id() as number:
+        monkeypatch.setenv("ROS_DOMAIN_ID", str(number))
+        monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+        yield number
+
+
+@pytest.fixture
+def start_process(ros_domain: int, tmp_path: Path) -> Iterator[StartProcess]:
+    """Starts ``python ARGUMENTS...`` in the test's domain and folder, e.g. ``start_process("-m", "package.node")``."""
+    processes: list[NodeProcess] = []
+
+    def start(*arguments: str | Path) -> NodeProcess:
+        log = tmp_path / f"process_{len(processes)}.log"
+        processes.append(NodeProcess(tuple(map(str, arguments)), log))
+        return processes[-1]
+
+    yield start
+    for process in reversed(processes):
+        process.end()
