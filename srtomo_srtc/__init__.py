@@ -1,0 +1,1 @@
+"""Soft real time: telemetry in, reconstructors out. Only ``node.py`` imports ROS."""

@@ -1,0 +1,85 @@
+"""Where points of the pupil fall on the layers; where the light is, in sub-apertures and in the whole pupil."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from srtomo_core.layout import SensorLayout, transmission
+from srtomo_core.system import Direction, Telescope
+
+Array = NDArray[np.float64]
+
+_FINE = 8  # points across a cell of the pupil grid when its lit share is found
+
+
+@dataclass(frozen=True)
+class Footprints:
+    """Points of the pupil, seen towards a star, on every layer.
+
+    Attributes:
+        x, y: (n_layers, n_points) m.
+    """
+
+    x: Array
+    y: Array
+
+
+def footprints(x: Array, y: Array, direction: Direction, distance: float, heights: Array) -> Footprints:
+    """Follow pupil points towards a star: ``xi_l x + h_l alpha`` with ``xi_l = 1 - h_l / distance`` (eq. 26).
+
+    Args:
+        x, y: (n_points,) in the pupil, m.
+        direction: of the star, rad.
+        distance: to the star along the line of sight, m; infinite for a natural star or science target.
+        heights: (n_layers,) of the layers along the line of sight, m.
+    """
+    h = heights[:, None]
+    cone = 1 - h / distance
+    return Footprints(cone * x + h * direction.x, cone * y + h * direction.y)
+
+
+@dataclass(frozen=True)
+class PupilGrid:
+    """Square cells over the pupil, those with any light.
+
+    Attributes:
+        x, y: (n_points,) centres, m, in C order (y, x).
+        weight: (n_points,) share of the pupil's light in each cell; sums to 1.
+    """
+
+    x: Array
+    y: Array
+    weight: Array
+
+
+def pupil_grid(telescope: Telescope, spacing: float) -> PupilGrid:
+    """Cover the pupil with cells of at most ``spacing`` (m), symmetric about its centre."""
+    across = math.ceil(telescope.diameter / spacing)
+    fine = telescope.diameter * ((np.arange(across * _FINE) + 0.5) / (across * _FINE) - 0.5)
+    light = transmission(telescope, *np.meshgrid(fine, fine)).reshape(across, _FINE, across, _FINE).mean(axis=(1, 3))
+    centres = telescope.diameter * ((np.arange(across) + 0.5) / across - 0.5)
+    x, y = np.meshgrid(centres, centres)
+    lit = light > 0
+    return PupilGrid(x[lit], y[lit], light[lit] / light.sum())
+
+
+def cell_light(telescope: Telescope, sensor: SensorLayout, cells: int, fine: int) -> tuple[Array, Array, Array]:
+    """Light in ``cells`` x ``cells`` equal cells of each sub-aperture, found from ``fine`` x ``fine`` points a cell.
+
+    Returns:
+        light: mean transmission of each cell, 0 to 1.
+        u, v: its centroid along the sensor's x and y, 0 to 1 across the cell; 0 in a dark one.
+
+        Each (n_valid, cells, cells), indexed [sub-aperture, y, x] in the sensor's own axes.
+    """
+    points = transmission(telescope, *sensor.points(cells * fine)).reshape(sensor.n_valid, cells, fine, cells, fine)
+    place = (np.arange(fine) + 0.5) / fine
+    light = points.mean(axis=(2, 4))
+    lit = np.where(light > 0, light, 1)
+    u = (points * place).mean(axis=(2, 4)) / lit
+    v = (points * place[:, None, None]).mean(axis=(2, 4)) / lit
+    return light, u, v

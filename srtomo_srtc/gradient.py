@@ -1,0 +1,88 @@
+"""What a Shack-Hartmann sensor measures: the mean gradient over each sub-aperture's light, from phase nodes.
+
+Phase is bilinear between nodes. Over one cell of the node grid the light-weighted mean of its gradient depends on the
+light only through the light's centroid (u, v), 0 to 1 across the cell::
+
+    dphi/dx = [(1-v) (phi_01 - phi_00) + v (phi_11 - phi_10)] / h          phi_[y][x], h: side of the cell
+
+A slope is the mean over the sub-aperture's cells, each weighted by its light. With 2 x 2 fully lit cells that is the
+3 x 3 stencil of eq. 28. With partial illumination it goes where eq. 30-31 mean to go, without their slips: those (as
+printed twice too large) give a nearly dark quarter of the sub-aperture the weight of a lit one, and divide 0 by 0 for
+a dark one. Whatever the light, a unit x-ramp gives exactly 1 in x and 0 in y, and piston gives 0.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from srtomo_core.layout import SensorLayout
+from srtomo_core.system import Telescope
+from srtomo_srtc.geometry import cell_light
+
+Array = NDArray[np.float64]
+
+LARGEST_SUBAPERTURE = 0.5
+"""A larger sub-aperture (a one-lens tip-tilt sensor's) is divided until its parts are no larger than this, m."""
+
+_OVERSAMPLING = 2  # node cells across a sub-aperture, or across such a part of one
+_FINE = 16  # points across a node cell when its light is averaged
+
+
+@dataclass(frozen=True)
+class GradientOperator:
+    """Slopes as a sparse product with the wavefront at nodes.
+
+    Attributes:
+        x, y: (n_nodes,) nodes in pupil coordinates, m.
+        matrix: (n_slopes, n_nodes) 1/m: metres of wavefront to radians of tilt, all x then all y, along the sensor's
+            own axes.
+    """
+
+    x: Array
+    y: Array
+    matrix: sparse.csr_array
+
+
+def gradient_operator(telescope: Telescope, sensor: SensorLayout) -> GradientOperator:
+    """The operator of one sensor, where ``sensor`` says that it is.
+
+    Raises:
+        ValueError: a sub-aperture is dark, so its slope means nothing.
+    """
+    cells = _OVERSAMPLING * max(1, math.ceil(sensor.size / LARGEST_SUBAPERTURE - 1e-9))
+    light, u, v = cell_light(telescope, sensor, cells, _FINE)
+    total = light.sum(axis=(1, 2), keepdims=True)
+    if not total.all():
+        raise ValueError(f"sensor {sensor.name}: sub-aperture {int(np.argmin(total))} is dark in this layout")
+    share = light / total * (cells / sensor.size)
+
+    n_grid = len(sensor.mask) * cells + 1
+    row, column = (index[:, None, None] * cells for index in np.nonzero(sensor.mask))
+    step = np.arange(cells)
+    corner = (row + step[:, None]) * n_grid + column + step  # (n_valid, cells, cells): each cell's node 00
+    slope = np.broadcast_to(np.arange(sensor.n_valid)[:, None, None], corner.shape)
+
+    node_00, node_01, node_10, node_11 = corner, corner + 1, corner + n_grid, corner + n_grid + 1
+    entries = [
+        (slope, node_00, -share * (1 - v)),
+        (slope, node_01, share * (1 - v)),
+        (slope, node_10, -share * v),
+        (slope, node_11, share * v),
+        (slope + sensor.n_valid, node_00, -share * (1 - u)),
+        (slope + sensor.n_valid, node_10, share * (1 - u)),
+        (slope + sensor.n_valid, node_01, -share * u),
+        (slope + sensor.n_valid, node_11, share * u),
+    ]
+    rows, columns, values = (np.concatenate([entry[k].ravel() for entry in entries]) for k in range(3))
+    matrix = sparse.coo_array((values, (rows, columns)), shape=(sensor.n_slopes, n_grid**2)).tocsr()
+    # between two equally lit cells a node's weights cancel but for rounding
+    matrix.data[np.abs(matrix.data) < 1e-12 * np.abs(matrix.data).max()] = 0
+    matrix.eliminate_zeros()
+    used = np.unique(matrix.indices)
+    node_y, node_x = (sensor.size * (index / cells - len(sensor.mask) / 2) for index in np.divmod(used, n_grid))
+    return GradientOperator(*sensor.to_pupil(node_x, node_y), matrix[:, used])

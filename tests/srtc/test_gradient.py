@@ -1,0 +1,97 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from srtomo_core.layout import Layout, SensorLayout, transmission
+from srtomo_core.system import System, Telescope, load_system
+from srtomo_srtc.gradient import GradientOperator, gradient_operator
+
+
+@pytest.fixture(scope="module")
+def mini() -> System:
+    return load_system("mini")
+
+
+def _local(sensor: SensorLayout, operator: GradientOperator) -> tuple[np.ndarray, np.ndarray]:
+    """Nodes in the sensor's own axes."""
+    x, y = operator.x - sensor.shift[0], operator.y - sensor.shift[1]
+    c, s = np.cos(sensor.rotation), np.sin(sensor.rotation)
+    return c * x + s * y, c * y - s * x
+
+
+def test_a_lit_subaperture_has_the_paper_s_stencil(mini: System) -> None:
+    place = Layout(mini).sensors[0]
+    operator = gradient_operator(Telescope(diameter=100.0, obscuration=0.0), place)
+    x, y = _local(place, operator)
+    i = int(np.argmin(np.hypot(*place.local.T)))
+    expected = np.array([[-1, 0, 1], [-2, 0, 2], [-1, 0, 1]]) / 4 / place.size
+    for row, stencil in ((i, expected), (i + place.n_valid, expected.T)):
+        for column, weight in zip(*operator.matrix[[row]].nonzero()[1:], operator.matrix[[row]].data):
+            at = (
+                np.rint(2 * (y[column] - place.local[i, 1]) / place.size),
+                np.rint(2 * (x[column] - place.local[i, 0]) / place.size),
+            )
+            assert weight == pytest.approx(stencil[int(at[0]) + 1, int(at[1]) + 1])
+        assert operator.matrix[[row]].nnz == 6
+
+
+@pytest.mark.parametrize("centre", [(0.0, 0.0), (0.35, -0.2), (-0.61, 0.43), (0.9, 0.8)])
+@pytest.mark.parametrize("threshold", [0.02, 0.5])
+def test_ramps_and_piston_under_any_illumination(mini: System, centre: tuple[float, float], threshold: float) -> None:
+    system = mini.with_changes(
+        {
+            "telescope.obscuration_centre": centre,
+            "sensors.*.illumination_threshold": threshold,
+            "sensors.3.rotation": 0.3,
+        }
+    )
+    for place in Layout(system).sensors:
+        operator = gradient_operator(system.telescope, place)
+        c, s, ones = np.cos(place.rotation), np.sin(place.rotation), np.ones(place.n_valid)
+        for wavefront, along_x, along_y in (
+            (operator.x, c, -s),
+            (operator.y, s, c),
+            (np.ones_like(operator.x), 0.0, 0.0),
+        ):
+            expected = np.concatenate([along_x * ones, along_y * ones])
+            np.testing.assert_allclose(operator.matrix @ wavefront, expected, atol=1e-12)
+
+
+def test_a_twisted_wavefront_shows_where_the_light_is(mini: System) -> None:
+    # x y is bilinear, so the operator is exact: the mean of its gradient (y, x) is the centroid of the light
+    for place in Layout(mini).sensors[:3]:
+        operator = gradient_operator(mini.telescope, place)
+        x, y = _local(place, operator)
+        light = transmission(mini.telescope, *place.points(32)).reshape(place.n_valid, -1)
+        step = place.size * ((np.arange(32) + 0.5) / 32 - 0.5)
+        fine_y, fine_x = (g.ravel() for g in np.meshgrid(step, step, indexing="ij"))
+        expected = np.concatenate(
+            [
+                place.local[:, 1] + light @ fine_y / light.sum(axis=1),
+                place.local[:, 0] + light @ fine_x / light.sum(axis=1),
+            ]
+        )
+        np.testing.assert_allclose(operator.matrix @ (x * y), expected, atol=1e-12)
+
+
+def test_a_whole_pupil_sensor_averages_over_the_light(mini: System) -> None:
+    place = Layout(mini).sensors[3]
+    operator = gradient_operator(mini.telescope, place)
+    nodes = np.stack([operator.x, operator.y], axis=1)
+    apart = np.sort(np.hypot(*(nodes[:, None] - nodes[None, :]).T), axis=0)[1]
+    assert apart.max() < 0.26
+    wavefront = np.sin(1.5 * operator.x + 0.4) * np.cos(0.8 * operator.y)
+    x, y = (p.ravel() for p in place.points(400))
+    light = transmission(mini.telescope, x, y)
+    expected = [
+        light @ (1.5 * np.cos(1.5 * x + 0.4) * np.cos(0.8 * y)) / light.sum(),
+        light @ (-0.8 * np.sin(1.5 * x + 0.4) * np.sin(0.8 * y)) / light.sum(),
+    ]
+    np.testing.assert_allclose(operator.matrix @ wavefront, expected, rtol=0.02)
+
+
+def test_a_dark_subaperture_is_refused(mini: System) -> None:
+    place = replace(Layout(mini).sensors[0], shift=(2.0, 0.0))
+    with pytest.raises(ValueError, match=r"sensor lgs1: sub-aperture .* is dark"):
+        gradient_operator(mini.telescope, place)
