@@ -1,0 +1,142 @@
+"""Shack-Hartmann slopes: the true gradient of the wavefront, averaged over the lit part of each sub-aperture.
+
+A sub-aperture that is lit all over is one square, any other is cut into cells that count by how much of each is lit.
+Over a square, and over an exposure, the average is exact: a filter on the layer's spectrum.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from itertools import groupby
+
+import numpy as np
+from numpy.typing import NDArray
+
+from srtomo_core.layout import Array, Layout, SensorLayout, transmission
+from srtomo_core.system import Sensor, System, Telescope
+from srtomo_sim.spline import add_weighted_pairs
+from srtomo_sim.turbulence import Screens
+
+_CELL = 0.05  # m, at most, where a sub-aperture is lit in part
+_MAX_CELLS = 40  # across a sub-aperture: larger lenses average over more
+_FINE = 64  # points across a sub-aperture, at least, to see which part of it is lit
+
+
+def lit_fractions(layout: SensorLayout, telescope: Telescope, across: int) -> Array:
+    """Mean transmission of the pupil over ``across`` x ``across`` equal cells of each sub-aperture.
+
+    Returns:
+        (n_valid, across, across), [sub-aperture, y, x] in the sensor's own axes.
+    """
+    light = np.ones((layout.n_valid, across, across))
+    part = np.flatnonzero(layout.illumination < 1)
+    edge = replace(layout, local=layout.local[part], illumination=layout.illumination[part])
+    fine = max(_FINE // across, 8)
+    points = transmission(telescope, *edge.points(across * fine))
+    light[part] = points.reshape(-1, across, fine, across, fine).mean(axis=(2, 4))
+    return light
+
+
+@dataclass(frozen=True)
+class Squares:
+    """Equal squares over which the gradient is averaged, grouped by sub-aperture.
+
+    Attributes:
+        side: m.
+        x, y: (n_squares,) centres in pupil coordinates, m.
+        weight: (n_squares,); they sum to 1 over each sub-aperture.
+        start: (n_groups + 1,) first square of each group.
+        subaperture: (n_groups,) whose group it is.
+    """
+
+    side: float
+    x: Array
+    y: Array
+    weight: Array
+    start: NDArray[np.int64]
+    subaperture: NDArray[np.int64]
+
+
+def cut(layout: SensorLayout, telescope: Telescope, max_cell: float = _CELL) -> list[Squares]:
+    """The squares of all sub-apertures: those lit all over whole, the others in cells of at most ``max_cell`` m."""
+    across = min(_MAX_CELLS, math.ceil(layout.size / max_cell - 1e-9))
+    light = lit_fractions(layout, telescope, across)
+    whole = layout.illumination == 1
+    squares = []
+    for n, chosen, lit in ((1, whole, np.ones((len(light), 1, 1))), (across, ~whole, light)):
+        index = np.flatnonzero(chosen)
+        if not len(index):
+            continue
+        x, y = (p[index] for p in layout.points(n))
+        weight = lit[index] / lit[index].sum(axis=(1, 2), keepdims=True)
+        used = weight > 0
+        start = np.concatenate([[0], np.cumsum(used.sum(axis=(1, 2)))])
+        squares.append(Squares(layout.size / n, x[used], y[used], weight[used], start, index))
+    return squares
+
+
+def atmospheric_slopes(
+    system: System,
+    layout: Layout,
+    screens: Screens,
+    n_frames: int,
+    progress: Callable[[float], None] = lambda done: None,
+) -> NDArray[np.float32]:
+    """Slopes of the turbulence alone, averaged over exposures 0 .. n_frames-1: (n_frames, n_slopes), rad.
+
+    Args:
+        progress: called with the share that is done, 0 to 1.
+    """
+    slopes = np.zeros((n_frames, layout.n_slopes), np.float32)
+    parts = [(i, squares) for i, sensor in enumerate(layout.sensors) for squares in cut(sensor, system.telescope)]
+    stars = [system.star_of(sensor) for sensor in system.sensors]
+    done = 0
+    for l, height in enumerate(screens.heights):
+
+        def filter_of(part: tuple[int, Squares], height: float = height) -> tuple[float, float]:
+            i, squares = part
+            return squares.side * (1 - height / system.los_range(stars[i])), layout.sensors[i].rotation
+
+        # sensors that share a filter share its transform
+        for averaging, members in groupby(sorted(parts, key=filter_of), filter_of):
+            spline = screens.gradient(l, *averaging)
+            for i, squares in members:
+                cone = 1 - height / system.los_range(stars[i])
+                mine, n = layout.slopes_of(i), layout.sensors[i].n_valid
+                add_weighted_pairs(
+                    spline,
+                    squares.x * cone / screens.grid.step,
+                    squares.y * cone / screens.grid.step,
+                    squares.weight * cone,
+                    squares.start,
+                    screens.drift(l, np.arange(n_frames), stars[i].position),
+                    squares.subaperture,
+                    slopes[:, mine.start : mine.start + n],
+                    slopes[:, mine.start + n : mine.stop],
+                )
+                done += 1
+                progress(done / (len(parts) * len(screens)))
+    return slopes
+
+
+def noise_sigma(system: System, layout: Layout) -> Array:
+    """Standard deviation of each slope's measurement noise: (n_slopes,) rad.
+
+    Centre of gravity of N electrons over ``pixels`` x ``pixels``: the spot's rms width times the excess noise over
+    sqrt(N), and read noise summed over the pixels' squared distances, over N.
+    """
+    sigma = [
+        np.tile(_subaperture_noise(sensor, sensor_layout, system.loop.rate), 2)
+        for sensor, sensor_layout in zip(system.sensors, layout.sensors, strict=True)
+    ]
+    return np.concatenate(sigma)
+
+
+def _subaperture_noise(sensor: Sensor, layout: SensorLayout, rate: float) -> Array:
+    electrons = sensor.photons * layout.size**2 * layout.illumination / rate
+    width = sensor.spot_fwhm / math.sqrt(8 * math.log(2))
+    pixel = (np.arange(sensor.pixels) - (sensor.pixels - 1) / 2) * sensor.pixel_scale
+    read = sensor.read_noise**2 * sensor.pixels * (pixel**2).sum()
+    return np.sqrt((width * sensor.excess_noise) ** 2 / electrons + read / electrons**2)
