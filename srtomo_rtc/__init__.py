@@ -1,0 +1,1 @@
+"""Hard real time: slopes in, commands out."""

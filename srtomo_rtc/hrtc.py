@@ -1,0 +1,330 @@
+"""From messages to commands: the frame gate around the loop. No ROS.
+
+Every frame number of a session gets exactly one answer. Messages are put in place by frame and sensor; a frame whose
+sensors are all in is answered at once. A frame that cannot be completed any more (a later one is complete, or two later
+ones have begun) is held, and so are whole frames when more than ``max_behind`` wait. Duplicates, late ones, other
+sessions, other instruments and damaged messages are counted and dropped.
+"""
+
+from __future__ import annotations
+
+import queue
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from srtomo_core.layout import Layout
+from srtomo_core.wire import DmCommandWriter, SlopeFrame, WireError, read_slope_frame
+from srtomo_rtc.latency import LatencyHistogram
+from srtomo_rtc.loop import Loop, Program, Verdict
+
+Floats = NDArray[np.float32]
+
+_AHEAD = 8  # frames that may be in assembly at once
+_RECENT = 64  # answered frames whose sensors are remembered, to tell a duplicate from a late message
+_MAX_GAP = 64  # frame numbers farther off than this are another count, like another session
+_SESSION_SILENCE = 1_000_000_000  # ns without a usable message after which another count may take over
+
+_SNAPSHOT_ROWS = 16  # commands in a snapshot: a command later than that is held after a resume
+
+_HELD = {
+    Verdict.HOLD_NONFINITE: "held_nonfinite",
+    Verdict.HOLD_INCOMPLETE: "held_incomplete",
+    Verdict.HOLD_MISSING: "held_missing",
+    Verdict.HOLD_BEHIND: "held_behind",
+    Verdict.HOLD_HISTORY: "held_history",
+}
+
+
+@dataclass
+class Counters:
+    """What happened since activation; names as in msgs_schema/msg/HrtcStatus."""
+
+    commands: int = 0
+    held_nonfinite: int = 0
+    held_incomplete: int = 0
+    held_missing: int = 0
+    held_behind: int = 0
+    held_history: int = 0
+    dropped_duplicate: int = 0
+    dropped_late: int = 0
+    dropped_session: int = 0
+    dropped_fingerprint: int = 0
+    dropped_malformed: int = 0
+    clipped: int = 0
+
+
+class Change(NamedTuple):
+    """Something that the loop took up, for the events: ``what`` is SESSION, PROGRAM or LOOP."""
+
+    what: str
+    session: int
+    frame: int
+    closed: bool
+    program: Program | None
+    reason: str
+
+
+class Snapshot(NamedTuple):
+    """The loop after a frame; fields as in msgs_schema/msg/HrtcState."""
+
+    stamp_sec: int
+    stamp_nanosec: int
+    session: int
+    frame: int
+    closed: bool
+    program: Program | None
+    consecutive_holds: int
+    first_frame: int
+    state: Floats
+    history: Floats
+
+
+class Hrtc:
+    """The frame gate, the loop and the command's buffer.
+
+    One thread, the loop's, calls :meth:`offer`, :meth:`advance` and :meth:`idle`. Counters, histogram and the loop's
+    public attributes may be read from any thread, which may also call :meth:`want_snapshot` and take from ``changes``
+    and ``snapshots``.
+
+    Args:
+        layout: of the instrument.
+        delay: mid-exposure to mid-command, frames.
+        publish: called with each serialised DmCommand, on the loop's thread.
+        deadline_ns: latency above which a frame counts as a miss.
+        max_behind: complete frames that may wait before whole frames are skipped.
+    """
+
+    def __init__(
+        self,
+        layout: Layout,
+        delay: float,
+        publish: Callable[[bytes], None],
+        *,
+        deadline_ns: int = 1_000_000_000,
+        max_behind: int = 4,
+    ) -> None:
+        if not 1 <= max_behind < _AHEAD:
+            raise ValueError(f"max_behind: expected 1 to {_AHEAD - 1} frames, got {max_behind}")
+        self.loop = Loop(layout, delay)
+        self.counters = Counters()
+        self.latency = LatencyHistogram(deadline_ns)
+        self.changes: queue.SimpleQueue[Change] = queue.SimpleQueue()
+        self.snapshots: queue.SimpleQueue[Snapshot] = queue.SimpleQueue()
+        self._snapshot_wanted = False
+        self.session = 0
+        self.last_slopes_ns = 0
+        self._publish = publish
+        self._max_behind = max_behind
+        self._fingerprint = layout.fingerprint
+        self._n_sensors = len(layout.sensors)
+        self._counts = tuple(s.n_valid for s in layout.sensors)
+        self._starts = tuple(int(start) // 2 for start in layout.slope_start)
+        self._writer = DmCommandWriter("dm", layout.n_commands)
+        self._slopes = [[np.zeros(2 * n, np.float32) for n in self._counts] for _ in range(_AHEAD)]
+        self._filled = np.zeros((_AHEAD, self._starts[-1]), bool)
+        self._missing = [list(self._counts) for _ in range(_AHEAD)]
+        self._arrived = [0] * _AHEAD
+        self._mirror: list[tuple[int, int, float]] = [(-1, -1, 1.0)] * _AHEAD
+        self._stamp = [(0, 0)] * _AHEAD
+        self._used = [0] * _RECENT
+        self._newest = -1
+        self._ready_ns = 0
+
+    def offer(self, buffer: bytes, now_ns: int) -> None:
+        """Put one serialised SlopeFrame in its place; ``now_ns`` (monotonic) is when it was taken.
+
+        Its product is formed at once if it belongs to the next frame. Nothing is answered before :meth:`advance`,
+        unless frames ahead of the assembly memory force it.
+        """
+        counters = self.counters
+        try:
+            message = read_slope_frame(buffer)
+        except WireError:
+            counters.dropped_malformed += 1
+            return
+        if message.fingerprint != self._fingerprint:
+            counters.dropped_fingerprint += 1
+            return
+        if not self._fits(message):
+            counters.dropped_malformed += 1
+            return
+        if message.session != self.session or abs(message.frame - self.loop.frame) > _MAX_GAP:
+            # one stray frame number must not move the loop: only silence makes room for another count
+            if self.session and now_ns - self.last_slopes_ns < _SESSION_SILENCE:
+                counters.dropped_session += 1
+                return
+            self._begin(message.session, message.frame)
+        elif message.frame < self.loop.frame:
+            self._too_late(message)
+            return
+        self.last_slopes_ns = now_ns
+        while message.frame >= self.loop.frame + _AHEAD:
+            self._answer_next(Verdict.HOLD_MISSING)
+        self._place(message)
+        self._ready_ns = now_ns
+
+    def _fits(self, message: SlopeFrame) -> bool:
+        first, n = message.sensor, message.n_sensors
+        if n < 1 or first + n > self._n_sensors:
+            return False
+        if n == 1:
+            return (
+                message.n_subapertures > 0
+                and message.first_subaperture + message.n_subapertures <= self._counts[first]
+            )
+        return message.first_subaperture == 0 and message.n_subapertures == self._starts[first + n] - self._starts[first]
+
+    def _begin(self, session: int, frame: int) -> None:
+        for place in range(_AHEAD):
+            self._clear(place)
+        for place in range(_RECENT):
+            self._used[place] = 0
+        same = session == self.session
+        reason = f"frames go on at {frame} instead of {self.loop.frame}" if same else "slopes of a new session"
+        # a loop that was closed while nothing came stays closed; later sessions start with an open one
+        closed = self.loop.closed and not self.session
+        self.session = session
+        self._newest = frame
+        self.loop.start(frame, closed)
+        self.changes.put(Change("SESSION", session, frame, closed, self.loop.program, reason))
+        self._prepare()
+
+    def _clear(self, place: int) -> None:
+        self._filled[place] = False
+        self._missing[place][:] = self._counts
+        self._arrived[place] = 0
+
+    def _too_late(self, message: SlopeFrame) -> None:
+        recent = self.loop.frame - message.frame <= _RECENT and message.frame >= self.loop.first_frame
+        if recent and self._used[message.frame % _RECENT] >> message.sensor & 1:
+            self.counters.dropped_duplicate += 1
+        else:
+            self.counters.dropped_late += 1
+
+    def _place(self, message: SlopeFrame) -> None:
+        place = message.frame % _AHEAD
+        start = self._starts[message.sensor] + message.first_subaperture
+        span = self._filled[place, start : start + message.n_subapertures]
+        if span.any():
+            self.counters.dropped_duplicate += 1
+            return
+        span[:] = True
+        if not self._arrived[place]:
+            self._mirror[place] = (message.mirror_frame, message.mirror_frame_before, message.mirror_fraction)
+            self._stamp[place] = (message.stamp_sec, message.stamp_nanosec)
+        if message.frame > self._newest:
+            self._newest = message.frame
+        taken = 0
+        for sensor in range(message.sensor, message.sensor + message.n_sensors):
+            count = message.n_subapertures if message.n_sensors == 1 else self._counts[sensor]
+            first, n = message.first_subaperture, self._counts[sensor]
+            own = self._slopes[place][sensor]
+            own[first : first + count] = message.slopes[taken : taken + count]
+            own[n + first : n + first + count] = message.slopes[taken + count : taken + 2 * count]
+            taken += 2 * count
+            self._missing[place][sensor] -= count
+            if self._missing[place][sensor] == 0:
+                self._arrived[place] |= 1 << sensor
+                if message.frame == self.loop.frame:
+                    self.loop.add(sensor, own)
+
+    def advance(self) -> None:
+        """Answer every frame that is complete, and hold every frame that cannot be completed any more."""
+        loop = self.loop
+        while True:
+            frame = loop.frame
+            if self._newest < frame:
+                return
+            complete = loop.sensors == loop.all_sensors
+            if self._newest - frame > self._max_behind:
+                self._answer_next(Verdict.HOLD_BEHIND if complete else Verdict.HOLD_MISSING)
+            elif complete:
+                self._answer_next(Verdict.OK)
+            elif self._newest >= frame + 2 or self._arrived[(frame + 1) % _AHEAD] == loop.all_sensors:
+                self._answer_next(Verdict.HOLD_MISSING)
+            else:
+                return
+
+    def want_snapshot(self) -> None:
+        """Ask for a Snapshot after the next answer, in ``snapshots``. Any thread."""
+        self._snapshot_wanted = True
+
+    def _snapshot(self, sec: int, nanosec: int) -> Snapshot:
+        # once a second, after the command is out: the one place of the loop's thread that allocates
+        loop = self.loop
+        return Snapshot(sec, nanosec, self.session, loop.answered, loop.closed, loop.program, loop.consecutive_holds,
+                        loop.first_frame, loop.state.copy(), loop.history(_SNAPSHOT_ROWS))  # fmt: skip
+
+    def idle(self) -> None:
+        """No slopes are waiting: take up what was posted or requested, unless a frame has begun."""
+        if self.loop.pending and self.loop.sensors == 0:
+            self._prepare()
+
+    def flatten(self) -> None:
+        """Open the loop and answer the next frame with the offset alone, whether or not its slopes came."""
+        self.loop.request(closed=False)
+        self.loop.state[:] = 0
+        self.loop.sensors = 0
+        self._prepare()
+        self._answer_next(Verdict.OPEN)
+
+    def _answer_next(self, verdict: Verdict) -> None:
+        loop, counters = self.loop, self.counters
+        frame, place = loop.frame, loop.frame % _AHEAD
+        program = loop.program
+        if verdict is Verdict.OK:
+            verdict = loop.answer(*self._mirror[place])
+        elif verdict is Verdict.OPEN:
+            loop.hold(verdict)
+        else:
+            if verdict is Verdict.HOLD_MISSING and self._filled[place].any():
+                verdict = Verdict.HOLD_INCOMPLETE
+            loop.hold(verdict)
+        ready = time.monotonic_ns()
+        settings = program.settings.id if program else 0
+        reconstructor = program.slot.id if program else 0
+        gain = program.slot.gain if program else 0.0
+        sec, nanosec = self._stamp[place] if self._filled[place].any() else (0, 0)
+        self._writer.values[:] = loop.command
+        # the names are msgs_schema/msg/DmCommand's, in its order
+        self._publish(
+            self._writer.write(
+                sec, nanosec, self.session, frame, reconstructor, settings, loop.used, verdict, loop.closed,
+                min(loop.n_clipped, 65535), gain, loop.mirror_frame, loop.mirror_frame_before, loop.mirror_fraction,
+                (ready - self._ready_ns) * 1e-9,
+            )
+        )  # fmt: skip
+        self.latency.add(time.monotonic_ns() - self._ready_ns)
+        counters.commands += 1
+        counters.clipped += loop.n_clipped
+        held = _HELD.get(verdict)
+        if held is not None:
+            setattr(counters, held, getattr(counters, held) + 1)
+        self._used[frame % _RECENT] = loop.used
+        self._clear(place)
+        if self._snapshot_wanted:
+            self._snapshot_wanted = False
+            self.snapshots.put(self._snapshot(sec, nanosec))
+        self._prepare()
+        arrived = self._arrived[loop.frame % _AHEAD]
+        if arrived:
+            slopes = self._slopes[loop.frame % _AHEAD]
+            for sensor in range(self._n_sensors):
+                if arrived >> sensor & 1:
+                    loop.add(sensor, slopes[sensor])
+
+    def _prepare(self) -> None:
+        loop = self.loop
+        program, closed = loop.program, loop.closed
+        loop.prepare()
+        if loop.program is not program:
+            self.changes.put(Change("PROGRAM", self.session, loop.frame, loop.closed, loop.program, ""))
+        if loop.closed is not closed:
+            by_faults = closed and loop.consecutive_holds > 0
+            reason = f"{loop.consecutive_holds} frames held in a row" if by_faults else "asked for"
+            self.changes.put(Change("LOOP", self.session, loop.frame, loop.closed, loop.program, reason))

@@ -1,0 +1,665 @@
+"""The HRTC as a ROS 2 lifecycle node: configure allocates, loads, locks and warms; activate runs.
+
+Three threads. The loop's thread waits for slopes, runs :class:`~srtomo_rtc.hrtc.Hrtc` and publishes commands. The
+executor's thread (main) serves lifecycle, parameters, services, status and events. One worker stages reconstructors.
+The executor and the worker never touch the loop's arrays: they post references and read counters.
+"""
+
+from __future__ import annotations
+
+from srtomo_rtc import realtime
+
+# before numpy loads
+_BLAS = realtime.pin_blas()
+
+import json
+import math
+import signal
+import threading
+import time
+import traceback
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import numpy as np
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from msgs_schema.msg import HrtcEvent, HrtcState, HrtcStatus
+from msgs_schema.msg import Reconstructor as ReconstructorMsg
+from msgs_schema.msg import ReconstructorBlock as ReconstructorBlockMsg
+from msgs_schema.srv import PublishReconstructor, SetStaticShape, SwapReconstructor
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.qos import QoSProfile
+from rclpy.signals import SignalHandlerOptions
+from std_srvs.srv import SetBool
+
+from srtomo_core import wire
+from srtomo_core.layout import Layout
+from srtomo_core.reconstructor import Reconstructor, ReconstructorError, load_interaction_matrix
+from srtomo_core.system import InstrumentError, load_system
+from srtomo_rtc.hot import HotEndpoints
+from srtomo_rtc.hrtc import Change, Hrtc, Snapshot
+from srtomo_rtc.loop import Program, Settings
+from srtomo_rtc.swap import Manifest, Refused, Swap
+from srtomo_rtc.vmm import KERNEL
+
+_ADOPTION_TIMEOUT = 2.0  # s for the loop to take up what was posted: it does between two frames, or at once if idle
+_RESEND_AFTER = 1.0  # s without a new block before missing ones are asked for
+_GIVE_UP_AFTER = 10.0  # s without a new block before a transfer is refused
+
+
+def _read_only(description: str) -> ParameterDescriptor:
+    return ParameterDescriptor(description=description, read_only=True)
+
+
+def _number(description: str, low: float, high: float) -> ParameterDescriptor:
+    return ParameterDescriptor(
+        description=description, floating_point_range=[FloatingPointRange(from_value=low, to_value=high)]
+    )
+
+
+def _integer(description: str, low: int, high: int, read_only: bool = False) -> ParameterDescriptor:
+    return ParameterDescriptor(
+        description=description, read_only=read_only, integer_range=[IntegerRange(from_value=low, to_value=high)]
+    )
+
+
+_PARAMETERS: tuple[tuple[str, Any, ParameterDescriptor], ...] = (
+    ("system", "", _read_only("instrument: name or path of a .yaml file")),
+    ("changes", "{}", _read_only('changes to the instrument as JSON, e.g. {"loop.rate": "1 kHz"}')),
+    ("interaction_matrix", "", _read_only("path of the calibrated interaction matrix G_cal (srtomo calibrate)")),
+    ("reconstructor", "", _read_only("path of a reconstructor to start with; empty: wait for one on the wire")),
+    ("keep", "", _read_only("path where the last committed reconstructor is kept for a restart; empty: nowhere")),
+    ("max_behind", 4, _integer("complete frames that may wait before whole frames are skipped", 1, 7, True)),
+    ("fifo_priority", 0, _integer("SCHED_FIFO priority of the loop's thread; 0: normal scheduling", 0, 99, True)),
+    ("deadline", 0.0, _read_only("latency above which a frame is a miss, s; 0: the loop's delay less one exposure")),
+    ("polc", True, ParameterDescriptor(description="pseudo-open-loop control; false: classical leaky integrator")),
+    ("leak", 0.0, _number("leak of a frame; 0 at configure: the instrument's", 0.0, 0.999)),
+    ("relaxation", 0.1, _number("share of the command that an open loop drops each frame", 0.001, 1.0)),
+    ("command_limit", 1.0, _number("m of wavefront, on top of the instrument's stroke", 1e-9, 1.0)),
+    ("fault_budget", 50, _integer("consecutive held frames after which the loop opens", 1, 1_000_000)),
+)
+_LIVE = ("polc", "leak", "relaxation", "command_limit", "fault_budget")
+
+
+def parameters() -> Iterable[tuple[str, Any, str]]:
+    """Name, default and description of each parameter."""
+    return ((name, default, descriptor.description) for name, default, descriptor in _PARAMETERS)
+
+
+class HrtcNode(LifecycleNode):
+    """The lifecycle node ``hrtc``. All methods run on the executor's thread unless they say otherwise."""
+
+    def __init__(self, context: rclpy.Context | None = None) -> None:
+        super().__init__("hrtc", context=context)
+        for name, default, descriptor in _PARAMETERS:
+            self.declare_parameter(name, default, descriptor)
+        self.add_on_set_parameters_callback(self._set_parameters)
+        self._hot_node = Node("hrtc_hot", context=context)
+        self._events = self.create_publisher(HrtcEvent, wire.EVENT.name, QoSProfile(**wire.EVENT.qos()))
+        self._states = self.create_publisher(HrtcState, wire.STATE.name, QoSProfile(**wire.STATE.qos()))
+        self._status = self.create_publisher(HrtcStatus, wire.STATUS.name, QoSProfile(**wire.STATUS.qos()))
+        self._diagnostics = self.create_publisher(
+            DiagnosticArray, wire.DIAGNOSTICS.name, QoSProfile(**wire.DIAGNOSTICS.qos())
+        )
+        self.create_service(SetBool, "hrtc/close_loop", self._close_loop)
+        self.create_service(SwapReconstructor, "hrtc/commit", self._commit)
+        self.create_service(SwapReconstructor, "hrtc/roll_back", self._roll_back)
+        self.create_service(SetStaticShape, "hrtc/static_shape", self._static_shape)
+        self._resend = self.create_client(PublishReconstructor, "srtc/publish")
+        self.create_subscription(
+            ReconstructorMsg, wire.RECONSTRUCTOR.name, self._on_manifest, QoSProfile(**wire.RECONSTRUCTOR.qos())
+        )
+        self.create_subscription(
+            ReconstructorBlockMsg,
+            wire.RECONSTRUCTOR_BLOCK.name,
+            self._on_block,
+            QoSProfile(**wire.RECONSTRUCTOR_BLOCK.qos()),
+            raw=True,
+        )
+        self.create_timer(0.1, self._every_100_ms)
+        self.create_timer(1.0, self._every_second)
+        self._worker = ThreadPoolExecutor(max_workers=1, thread_name_prefix="staging")
+        self._manifest: Manifest | None = None
+        self._early_blocks: list[wire.ReconstructorBlock] = []
+        self._last_block = 0.0
+        self._resend_asked = 0.0
+        self._kinds: dict[int, tuple[int, str]] = {}
+        self._taken_up: tuple[Program | None, int] = (None, 0)  # the newest program that the loop runs, its first frame
+        self._refused = 0
+        self._realtime: list[realtime.Outcome] = [_BLAS]
+        self._hrtc: Hrtc | None = None
+        self._swap: Swap | None = None
+        self._hot: HotEndpoints | None = None
+        self._thread: threading.Thread | None = None
+        self._stop = threading.Event()
+        self._lifecycle = "unconfigured"
+        self.failure: str | None = None
+
+    # -- lifecycle --------------------------------------------------------------------------------------------------
+
+    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Allocate, load, lock and warm."""
+        return self._transition("inactive", self._configure)
+
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Start the loop's thread."""
+        return self._transition("active", self._activate)
+
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Open the loop, publish flat, stop the loop's thread."""
+        return self._transition("inactive", self.stop_loop)
+
+    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Give memory and endpoints back."""
+        return self._transition("unconfigured", self._clean_up)
+
+    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Stop whatever runs."""
+        return self._transition("finalized", self.stop_loop)
+
+    def _transition(self, name: str, action: Callable[[], None]) -> TransitionCallbackReturn:
+        # rclpy prints nothing of a lifecycle callback that raises
+        try:
+            action()
+        except (InstrumentError, ReconstructorError, Refused, ValueError) as error:
+            self.get_logger().error(str(error))
+            self.failure = str(error)
+            return TransitionCallbackReturn.FAILURE
+        except Exception:
+            self.get_logger().error(traceback.format_exc())
+            self.failure = traceback.format_exc().splitlines()[-1]
+            return TransitionCallbackReturn.ERROR
+        self._lifecycle = name
+        self._event(HrtcEvent.LIFECYCLE, text=name)
+        return TransitionCallbackReturn.SUCCESS
+
+    def _value(self, name: str) -> Any:
+        return self.get_parameter(name).value
+
+    def _configure(self) -> None:
+        if not self._value("system"):
+            raise InstrumentError("parameter system: expected a name or the path of a .yaml file")
+        system = load_system(self._value("system"), json.loads(self._value("changes")))
+        layout = Layout(system)
+        if not self._value("interaction_matrix"):
+            raise ReconstructorError("parameter interaction_matrix: expected a file made by 'srtomo calibrate'")
+        G_cal = load_interaction_matrix(self._value("interaction_matrix"), layout.fingerprint)
+        loop = system.loop
+        deadline = self._value("deadline") or max(loop.delay - 1, 0.1) / loop.rate
+        hot = HotEndpoints(self._hot_node, wire.COMMAND.depth_at(loop.rate))
+        self._hrtc = Hrtc(
+            layout,
+            loop.delay,
+            hot.publish,
+            deadline_ns=int(deadline * 1e9),
+            max_behind=self._value("max_behind"),
+        )
+        self._hot = hot
+        settings = Settings(
+            id=1,
+            offset=np.zeros(layout.n_commands, np.float32),
+            slope_reference=np.zeros(layout.n_slopes, np.float32),
+            polc=self._value("polc"),
+            leak=self._value("leak") or loop.leak,
+            relaxation=self._value("relaxation"),
+            command_limit=self._value("command_limit"),
+            fault_budget=self._value("fault_budget"),
+        )
+        self._swap = Swap(system, layout, G_cal, settings, self._post)
+        self._layout = layout
+        self._load_first()
+        self._realtime = [_BLAS, realtime.lock_memory(), realtime.quiet_interpreter()]
+        # a manifest and blocks may have come while there was no memory for them
+        if self._manifest is not None:
+            self._begin(self._manifest)
+
+    def _load_first(self) -> None:
+        """Start from the file of parameter ``reconstructor``, or else from the last one committed."""
+        assert self._swap is not None
+        path = self._value("reconstructor")
+        keep = self._value("keep")
+        if not path and keep and Path(keep).exists():
+            path = keep
+        if path:
+            held = self._swap.stage_whole(Reconstructor.load(path))
+            program = self._swap.commit(held.slot.id, held.slot.sha256)
+            self._kinds[id(program)] = (HrtcEvent.COMMIT, f"{held.label} from {Path(path).name}")
+
+    def _activate(self) -> None:
+        self._stop.clear()
+        self._thread = threading.Thread(target=self._run, name="loop", daemon=True)
+        self._thread.start()
+
+    def stop_loop(self) -> None:
+        """Open the loop, publish flat, end the loop's thread. From every state; twice does no harm."""
+        self._stop.set()
+        if self._hot is not None:
+            self._hot.wake()
+        if self._thread is not None:
+            self._thread.join()
+            self._thread = None
+            self._publish_changes()
+
+    def _clean_up(self) -> None:
+        self.stop_loop()
+        self._worker.submit(lambda: None).result()
+        if self._hot is not None:
+            self._hot.destroy()
+        self._hot = self._hrtc = self._swap = None
+
+    def close(self) -> None:
+        """Stop everything, in an order that never publishes into what is gone."""
+        self.stop_loop()
+        self._worker.shutdown(wait=True)
+        if self._hot is not None:
+            self._hot.destroy()
+            self._hot = None
+        self._hot_node.destroy_node()
+        self.destroy_node()
+
+    # -- the loop's thread ------------------------------------------------------------------------------------------
+
+    def _run(self) -> None:
+        """Wait, take, answer, until told to stop. The loop's thread."""
+        hrtc, hot = self._hrtc, self._hot
+        assert hrtc is not None and hot is not None
+        self._realtime.append(realtime.fifo_priority(self._value("fifo_priority")))
+        try:
+            with hot:
+                while not self._stop.is_set():
+                    hot.wait(100_000_000)
+                    while True:
+                        message = hot.take()
+                        if message is None:
+                            break
+                        hrtc.offer(message, time.monotonic_ns())
+                    hrtc.advance()
+                    hrtc.idle()
+                if hrtc.session and (hrtc.loop.closed or hrtc.loop.state.any()):
+                    hrtc.flatten()
+        except Exception:
+            self.failure = "the loop's thread died: " + traceback.format_exc()
+            self.get_logger().fatal(self.failure)
+            self._stop.set()
+
+    def _post(self, program: Program) -> None:
+        assert self._hrtc is not None
+        self._hrtc.loop.post(program)
+        if self._hot is not None:
+            self._hot.wake()
+
+    # -- reconstructors on the wire ---------------------------------------------------------------------------------
+
+    def _on_manifest(self, message: Any) -> None:
+        self._manifest = Manifest(
+            sha256=bytes(message.sha256),
+            fingerprint=bytes(message.fingerprint),
+            n_commands=message.n_commands,
+            n_slopes=message.n_slopes,
+            n_epochs=message.n_epochs,
+            n_blocks=message.n_blocks,
+            gain=message.gain,
+            slope_reference=np.array(message.slope_reference, np.float32),
+            command_limit=np.array(message.command_limit, np.float32),
+            probe_commands=np.array(message.probe_commands, np.float32),
+            probe_slopes=np.array(message.probe_slopes, np.float32),
+            label=message.label,
+        )
+        if message.id != self._manifest.id:
+            self._refuse(self._manifest, "id is not the first 8 bytes of sha256")
+        elif self._swap is not None:
+            self._begin(self._manifest)
+
+    def _begin(self, manifest: Manifest) -> None:
+        assert self._swap is not None
+        known = (self._swap.active, self._swap.staged, self._swap.previous)
+        if any(held is not None and held.slot.sha256 == manifest.sha256 for held in known):
+            return  # a late repetition of what is here already
+        self._last_block = self._resend_asked = time.monotonic()
+        self._watch(self._worker.submit(self._swap.begin, manifest), manifest)
+        early, self._early_blocks = self._early_blocks, []
+        for block in early:
+            self._take(block)
+
+    def _on_block(self, data: bytes) -> None:
+        try:
+            block = wire.read_block(data)
+        except wire.WireError as error:
+            self.get_logger().warning(f"srtc/reconstructor_block: {error}")
+            return
+        if self._swap is None or self._manifest is None or block.sha256 != self._manifest.sha256:
+            # blocks and manifest are two topics: a block may come before its manifest
+            self._early_blocks = [*self._early_blocks, block][-wire.RECONSTRUCTOR_BLOCK.depth :]
+            return
+        self._take(block)
+
+    def _take(self, block: wire.ReconstructorBlock) -> None:
+        swap, manifest = self._swap, self._manifest
+        assert swap is not None and manifest is not None
+        self._last_block = time.monotonic()
+
+        def take() -> None:
+            if swap.take(block):
+                held = swap.stage()
+                self._event(
+                    HrtcEvent.STAGED,
+                    text=f"{held.label}: stability {held.check.stability:.3f}, "
+                    f"scale {held.check.scale[0]:.2f} to {held.check.scale[1]:.2f}",
+                    reconstructor=(held.slot.id, held.slot.sha256),
+                )
+
+        self._watch(self._worker.submit(take), manifest)
+
+    def _watch(self, future: Future[None], manifest: Manifest) -> None:
+        """Report what the worker refuses; the callback runs on the worker's thread."""
+
+        def report(done: Future[None]) -> None:
+            error = done.exception()
+            if isinstance(error, Refused):
+                self._refuse(manifest, str(error))
+            elif error is not None:
+                self.get_logger().error(f"staging failed: {error!r}")
+
+        future.add_done_callback(report)
+
+    def _refuse(self, manifest: Manifest, reason: str) -> None:
+        self._refused += 1
+        self.get_logger().warning(f"reconstructor {manifest.id:016x} refused: {reason}")
+        self._event(HrtcEvent.REFUSED, text=reason, reconstructor=(manifest.id, manifest.sha256))
+
+    def _ask_again(self) -> None:
+        missing = self._swap.missing if self._swap is not None else None
+        if missing is None:
+            return
+        now = time.monotonic()
+        identity, blocks = missing
+        if now - self._last_block > _GIVE_UP_AFTER:
+            manifest = self._manifest
+            self._manifest = None
+            assert self._swap is not None and manifest is not None
+            self._swap.forget()
+            self._refuse(manifest, f"{len(blocks)} of {manifest.n_blocks} blocks never came")
+        elif now - max(self._last_block, self._resend_asked) > _RESEND_AFTER and self._resend.service_is_ready():
+            self._resend_asked = now
+            self._resend.call_async(PublishReconstructor.Request(id=identity, blocks=blocks))
+
+    # -- services ---------------------------------------------------------------------------------------------------
+
+    def _close_loop(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
+        hrtc = self._hrtc
+        if hrtc is None or self._thread is None:
+            response.message = "the HRTC is not active"
+        elif request.data and (self._swap is None or self._swap.active is None):
+            response.message = "no reconstructor is active: commit one first"
+        else:
+            hrtc.loop.request(closed=request.data)
+            assert self._hot is not None
+            self._hot.wake()
+            response.success = self._wait_for(lambda: hrtc.loop.closed is request.data)
+            response.message = "closed" if hrtc.loop.closed else "open"
+        self._publish_changes()
+        return response
+
+    def _commit(
+        self, request: SwapReconstructor.Request, response: SwapReconstructor.Response
+    ) -> SwapReconstructor.Response:
+        return self._swap_service(request, response, HrtcEvent.COMMIT)
+
+    def _roll_back(
+        self, request: SwapReconstructor.Request, response: SwapReconstructor.Response
+    ) -> SwapReconstructor.Response:
+        return self._swap_service(request, response, HrtcEvent.ROLLBACK)
+
+    def _swap_service(self, request: Any, response: Any, kind: int) -> Any:
+        swap = self._swap
+        if swap is None:
+            response.message = "the HRTC is not configured"
+            return response
+        action = swap.commit if kind == HrtcEvent.COMMIT else swap.roll_back
+        try:
+            program = self._worker.submit(action, request.id, bytes(request.sha256)).result()
+        except Refused as error:
+            self._event(
+                HrtcEvent.REFUSED, text=str(error), reconstructor=(request.id, bytes(request.sha256))
+            )
+            response.message = str(error)
+            return response
+        assert swap.active is not None
+        self._kinds[id(program)] = (kind, swap.active.label)
+        response.success, response.first_frame, response.message = self._adopted(program, swap.active.label)
+        self._keep()
+        return response
+
+    def _static_shape(
+        self, request: SetStaticShape.Request, response: SetStaticShape.Response
+    ) -> SetStaticShape.Response:
+        swap = self._swap
+        if swap is None:
+            response.message = "the HRTC is not configured"
+            return response
+        pair = {}
+        for name, values, count in (
+            ("offset", request.offset, self._layout.n_commands),
+            ("slope_reference", request.slope_reference, self._layout.n_slopes),
+        ):
+            array = np.array(values, np.float32) if len(values) else np.zeros(count, np.float32)
+            if array.shape != (count,) or not np.isfinite(array).all():
+                response.message = f"{name}: expected {count} finite values, got {len(values)}"
+                return response
+            pair[name] = array
+        program = self._worker.submit(lambda: swap.change_settings(**pair)).result()
+        response.settings = swap.settings.id
+        if program is None:
+            response.success, response.message = True, "taken up with the first reconstructor"
+        else:
+            self._kinds[id(program)] = (HrtcEvent.SETTINGS, "static shape")
+            response.success, response.first_frame, response.message = self._adopted(program, "static shape")
+        return response
+
+    def _adopted(self, program: Program, what: str) -> tuple[bool, int, str]:
+        """Wait until the loop runs ``program``: (success, first frame, message)."""
+        hrtc = self._hrtc
+        assert hrtc is not None
+        if self._thread is None:
+            return True, hrtc.loop.frame, f"{what}: in force when the HRTC is activated"
+        if not self._wait_for(lambda: hrtc.loop.program is program):
+            return False, 0, f"{what}: posted, but the loop has not taken it up in {_ADOPTION_TIMEOUT:g} s"
+        self._publish_changes()
+        return True, self._taken_up[1], what
+
+    @staticmethod
+    def _wait_for(condition: Callable[[], bool]) -> bool:
+        end = time.monotonic() + _ADOPTION_TIMEOUT
+        while time.monotonic() < end:
+            if condition():
+                return True
+            time.sleep(0.0005)
+        return condition()
+
+    def _keep(self) -> None:
+        path = self._value("keep")
+        if path:
+            assert self._swap is not None
+            self._worker.submit(self._swap.save_active, path)
+
+    # -- parameters -------------------------------------------------------------------------------------------------
+
+    def _set_parameters(self, parameters: Sequence[Parameter]) -> SetParametersResult:
+        swap = self._swap
+        changes = {p.name: p.value for p in parameters if p.name in _LIVE}
+        if swap is not None and changes:
+            program = self._worker.submit(lambda: swap.change_settings(**changes)).result()
+            if program is not None:
+                text = ", ".join(f"{name} = {value}" for name, value in changes.items())
+                self._kinds[id(program)] = (HrtcEvent.SETTINGS, text)
+        return SetParametersResult(successful=True)
+
+    # -- what is published ------------------------------------------------------------------------------------------
+
+    def _event(
+        self,
+        kind: int,
+        *,
+        text: str = "",
+        reconstructor: tuple[int, bytes] | None = None,
+        change: Change | None = None,
+    ) -> None:
+        """Publish an event; from the executor's or the worker's thread."""
+        message = HrtcEvent(kind=kind, text=text, kernel=KERNEL)
+        message.header.stamp = self.get_clock().now().to_msg()
+        hrtc, swap = self._hrtc, self._swap
+        program = change.program if change is not None else hrtc.loop.program if hrtc is not None else None
+        settings = program.settings if program is not None else swap.settings if swap is not None else None
+        if hrtc is not None:
+            message.session = change.session if change is not None else hrtc.session
+            message.first_frame = change.frame if change is not None else hrtc.loop.frame
+            message.loop_state = int(change.closed if change is not None else hrtc.loop.closed)
+            message.delay = hrtc.loop.delay
+        if reconstructor is not None:
+            message.reconstructor, message.sha256 = reconstructor[0], list(reconstructor[1])
+        elif program is not None:
+            message.reconstructor, message.sha256 = program.slot.id, list(program.slot.sha256)
+        if settings is not None:
+            message.settings = settings.id
+            message.polc = settings.polc
+            message.leak = settings.leak
+            message.relaxation = settings.relaxation
+            message.command_limit = settings.command_limit
+            message.fault_budget = settings.fault_budget
+            if change is not None and change.what == "PROGRAM":
+                message.offset = settings.offset.tolist()
+                message.slope_reference = settings.slope_reference.tolist()
+        self._events.publish(message)
+
+    def _publish_changes(self) -> None:
+        hrtc = self._hrtc
+        while hrtc is not None and not hrtc.changes.empty():
+            change = hrtc.changes.get()
+            if change.what == "PROGRAM":
+                kind, text = self._kinds.pop(id(change.program), (HrtcEvent.SETTINGS, ""))
+                self._taken_up = (change.program, change.frame)
+            else:
+                kind = HrtcEvent.LOOP if change.what == "LOOP" else HrtcEvent.SESSION
+                text = change.reason
+            self._event(kind, text=text, change=change)
+
+    def _publish_snapshot(self, snapshot: Snapshot) -> None:
+        message = HrtcState(
+            session=snapshot.session,
+            frame=snapshot.frame,
+            loop_state=int(snapshot.closed),
+            consecutive_holds=snapshot.consecutive_holds,
+            first_frame=snapshot.first_frame,
+            state=snapshot.state.tolist(),
+            n_frames=len(snapshot.history),
+            history=snapshot.history.ravel().tolist(),
+        )
+        message.header.stamp.sec, message.header.stamp.nanosec = snapshot.stamp_sec, snapshot.stamp_nanosec
+        if snapshot.program is not None:
+            message.reconstructor = snapshot.program.slot.id
+            message.sha256 = list(snapshot.program.slot.sha256)
+            message.settings = snapshot.program.settings.id
+        self._states.publish(message)
+
+    def _every_100_ms(self) -> None:
+        self._publish_changes()
+        self._ask_again()
+        message = HrtcStatus(state=self._lifecycle, reconstructors_refused=self._refused)
+        message.header.stamp = self.get_clock().now().to_msg()
+        message.realtime = "; ".join(str(outcome) for outcome in self._realtime)
+        hrtc, swap, hot = self._hrtc, self._swap, self._hot
+        if hrtc is not None and swap is not None and hot is not None:
+            while not hrtc.snapshots.empty():
+                self._publish_snapshot(hrtc.snapshots.get())
+            loop = hrtc.loop
+            message.slope_publishers, message.command_readers = hot.matched()
+            message.session = hrtc.session
+            message.frame = max(loop.answered, 0)
+            message.loop_state = int(loop.closed)
+            message.loop_opened_by_faults = loop.opened_by_faults
+            for name in ("active", "staged", "previous"):
+                held = getattr(swap, name)
+                setattr(message, "reconstructor" if name == "active" else name, held.slot.id if held else 0)
+            if swap.active is not None:
+                message.stability = swap.active.check.stability
+                message.gain = swap.active.slot.gain
+            for name, value in vars(hrtc.counters).items():
+                setattr(message, name, value)
+            latency = hrtc.latency
+            message.deadline = latency.deadline_ns * 1e-9
+            message.deadline_misses = latency.misses
+            message.latency_p50 = latency.quantile(0.5)
+            message.latency_p99 = latency.quantile(0.99)
+            message.latency_p999 = latency.quantile(0.999)
+            message.latency_max = latency.max_ns * 1e-9
+            message.silence = (time.monotonic_ns() - hrtc.last_slopes_ns) * 1e-9 if hrtc.session else math.inf
+        self._status.publish(message)
+        self._last_status = message
+
+    def _every_second(self) -> None:
+        if self._hrtc is not None:
+            self._hrtc.want_snapshot()
+        status = DiagnosticStatus(name="hrtc", hardware_id=self.get_namespace())
+        status.level, status.message = self._health()
+        status.values = [KeyValue(key="lifecycle", value=self._lifecycle)] + [
+            KeyValue(key=outcome.name, value=str(outcome)) for outcome in self._realtime
+        ]
+        message = DiagnosticArray(status=[status])
+        message.header.stamp = self.get_clock().now().to_msg()
+        self._diagnostics.publish(message)
+
+    def _health(self) -> tuple[bytes, str]:
+        hrtc = self._hrtc
+        if self.failure is not None:
+            return DiagnosticStatus.ERROR, self.failure
+        if hrtc is None or self._thread is None:
+            return DiagnosticStatus.OK, self._lifecycle
+        period = 1.0 / 10
+        silence = (time.monotonic_ns() - hrtc.last_slopes_ns) * 1e-9
+        if hrtc.loop.opened_by_faults:
+            return DiagnosticStatus.ERROR, f"the loop opened by itself {hrtc.loop.opened_by_faults} times"
+        if not hrtc.session:
+            return DiagnosticStatus.OK, "waiting for slopes"
+        if silence > period:
+            return DiagnosticStatus.WARN, f"no slopes for {silence:.1f} s"
+        if hrtc.latency.misses:
+            return DiagnosticStatus.WARN, f"{hrtc.latency.misses} deadline misses"
+        return DiagnosticStatus.OK, "closed" if hrtc.loop.closed else "open"
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the node until SIGINT or SIGTERM. ``arguments``: ROS arguments (``--ros-args -p system:=mini ...``)."""
+    # rclpy's own handlers shut the context first, after which flat could not be published any more
+    rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
+    stop = threading.Event()
+
+    def on_signal(number: int, frame: FrameType | None) -> None:
+        stop.set()
+
+    signal.signal(signal.SIGINT, on_signal)
+    signal.signal(signal.SIGTERM, on_signal)
+    node = HrtcNode()
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    try:
+        while not stop.is_set():
+            executor.spin_once(timeout_sec=0.1)
+    finally:
+        executor.remove_node(node)
+        failed = node.failure is not None and "thread died" in node.failure
+        node.close()
+        executor.shutdown()
+        rclpy.shutdown()
+    return 1 if failed else 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,80 @@
+"""Real-time settings: each one applied, and reported with the reason where the system refused.
+
+Import this module first: :func:`pin_blas` must run before numpy loads.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import gc
+import os
+import resource
+import sys
+from typing import NamedTuple
+
+_BLAS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+_MCL_CURRENT, _MCL_FUTURE = 1, 2
+
+
+class Outcome(NamedTuple):
+    """Whether a setting was applied, and why not."""
+
+    name: str
+    applied: bool
+    detail: str
+
+    def __str__(self) -> str:
+        return f"{self.name} {self.detail}" if self.applied else f"{self.name} refused: {self.detail}"
+
+
+def pin_blas(threads: int = 1) -> Outcome:
+    """Set the number of BLAS threads; refused when numpy is loaded already and another number was in force."""
+    name = "blas threads"
+    in_force = os.environ.get(_BLAS[0])
+    if "numpy" in sys.modules and in_force != str(threads):
+        return Outcome(name, False, f"numpy was loaded first ({in_force or 'unset'} threads)")
+    for variable in _BLAS:
+        os.environ[variable] = str(threads)
+    return Outcome(name, True, str(threads))
+
+
+def lock_memory() -> Outcome:
+    """mlockall: no page of the process is swapped out."""
+    name = "memory lock"
+    soft, _ = resource.getrlimit(resource.RLIMIT_MEMLOCK)
+    if soft != resource.RLIM_INFINITY and os.geteuid() != 0:
+        # locking future pages under a limit would turn a later allocation into a crash
+        return Outcome(name, False, f"RLIMIT_MEMLOCK is {soft} bytes, needs unlimited")
+    libc = ctypes.CDLL(None, use_errno=True)
+    if libc.mlockall(_MCL_CURRENT | _MCL_FUTURE) == 0:
+        return Outcome(name, True, "on")
+    return Outcome(name, False, os.strerror(ctypes.get_errno()))
+
+
+def fifo_priority(priority: int) -> Outcome:
+    """SCHED_FIFO for the calling thread."""
+    name = "SCHED_FIFO"
+    if priority <= 0:
+        return Outcome(name, True, "not asked for")
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
+    except (OSError, ValueError) as error:
+        return Outcome(name, False, f"{error} (RLIMIT_RTPRIO)")
+    return Outcome(name, True, str(priority))
+
+
+def idle_priority() -> Outcome:
+    """SCHED_IDLE for the calling process: it computes only where nothing else wants the core."""
+    try:
+        os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
+    except OSError as error:
+        return Outcome("SCHED_IDLE", False, str(error))
+    return Outcome("SCHED_IDLE", True, "on")
+
+
+def quiet_interpreter() -> Outcome:
+    """Freeze all that lives now out of garbage collection, and let threads switch 10 times as readily."""
+    gc.collect()
+    gc.freeze()
+    sys.setswitchinterval(0.0005)
+    return Outcome("garbage collection", True, "frozen")
