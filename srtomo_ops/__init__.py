@@ -1,0 +1,1 @@
+"""What people do with srtomo: the command line, the demo, benchmarks."""

@@ -1,0 +1,41 @@
+"""``srtomo calibrate``."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from srtomo_core.layout import Layout
+from srtomo_core.reconstructor import save_interaction_matrix
+from srtomo_core.system import System
+from srtomo_ops.options import add_json, add_system, system_of, writable_file, write_json
+from srtomo_sim.mirror import interaction_matrix
+
+EXAMPLE = "example:\n  srtomo calibrate gnao_ltao_sr -o gnao_gcal.npz"
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Arguments of the command."""
+    add_system(parser)
+    parser.add_argument("-o", "--output", metavar="FILE", type=Path, required=True, help="the .npz to write")
+    add_json(parser)
+
+
+def calibrate(system: System, path: Path) -> Layout:
+    """Poke every actuator of the simulated instrument and write the interaction matrix, rad/m."""
+    layout = Layout(system)
+    G = interaction_matrix(system, layout)
+    save_interaction_matrix(path, G, layout.fingerprint, {"source": "simulated instrument", "system": system.name})
+    return layout
+
+
+def main(options: argparse.Namespace) -> int:
+    """Run the command."""
+    system = system_of(options)
+    layout = calibrate(system, writable_file(options.output))
+    print(f"{options.output}: {layout.n_slopes} slopes x {layout.n_commands} commands, rad/m")
+    write_json(
+        options.json,
+        {"system": system.name, "slopes": layout.n_slopes, "commands": layout.n_commands, "output": str(options.output)},
+    )
+    return 0

@@ -1,0 +1,30 @@
+"""``srtomo record``."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from srtomo_ops.options import add_json, add_system, system_of, write_json
+
+EXAMPLE = "example:\n  srtomo record gnao_ltao_sr -o night1 --namespace gnao"
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Arguments of the command."""
+    add_system(parser)
+    parser.add_argument("-o", "--output", metavar="BAG", type=Path, required=True, help="directory to make")
+    parser.add_argument("--namespace", default="", help="of the topics (default: none)")
+    parser.add_argument("--topics", metavar="NAME", nargs="+", help="only these, e.g. wfs/slopes (default: all)")
+    add_json(parser)
+
+
+def main(options: argparse.Namespace) -> int:
+    """Record until SIGINT or SIGTERM; exit code 1 if something that should be in the bag is not."""
+    system = system_of(options)
+    from srtomo_rtc.recorder_node import run, table
+
+    report = run(options.output, system, namespace=options.namespace, topics=options.topics)
+    print(table(report))
+    write_json(options.json, report)
+    return 0

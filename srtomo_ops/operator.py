@@ -1,0 +1,151 @@
+"""Calls to running nodes, as an operator makes them: lifecycle, closing the loop, publishing and committing."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
+from msgs_schema.msg import HrtcStatus, RecorderStatus, SimStatus
+from msgs_schema.srv import PublishReconstructor, SwapReconstructor
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.qos import QoSProfile
+from std_srvs.srv import SetBool, Trigger
+
+from srtomo_core import wire
+
+TRANSITIONS = {
+    "configure": Transition.TRANSITION_CONFIGURE,
+    "activate": Transition.TRANSITION_ACTIVATE,
+    "deactivate": Transition.TRANSITION_DEACTIVATE,
+    "cleanup": Transition.TRANSITION_CLEANUP,
+}
+
+
+class OperatorError(ValueError):
+    """A node that does not answer, or refuses; one line with its reason."""
+
+
+class Operator(Node):
+    """A node that calls the others and remembers their latest status. One thread calls everything.
+
+    Attributes:
+        hrtc, recorder, sim: the latest status of each, or None.
+    """
+
+    def __init__(self, namespace: str = "", name: str = "operator") -> None:
+        super().__init__(name, namespace=namespace)
+        self._executor = SingleThreadedExecutor()
+        self._executor.add_node(self)
+        self.hrtc: HrtcStatus | None = None
+        self.recorder: RecorderStatus | None = None
+        self.sim: SimStatus | None = None
+        for topic, kind, attribute in (
+            (wire.STATUS, HrtcStatus, "hrtc"),
+            (wire.RECORDER_STATUS, RecorderStatus, "recorder"),
+            (wire.SIM_STATUS, SimStatus, "sim"),
+        ):
+            self.create_subscription(
+                kind,
+                topic.name,
+                lambda message, attribute=attribute: setattr(self, attribute, message),
+                QoSProfile(**topic.qos()),
+            )
+
+    def spin(self, seconds: float) -> None:
+        """Take messages for a while."""
+        end = time.monotonic() + seconds
+        while (left := end - time.monotonic()) > 0:
+            self._executor.spin_once(timeout_sec=left)
+
+    def call(self, kind: Any, service: str, request: Any, timeout: float = 10.0) -> Any:
+        """Call a service.
+
+        Raises:
+            OperatorError: it is not there, or does not answer in time.
+        """
+        client = self.create_client(kind, service)
+        try:
+            end = time.monotonic() + timeout
+            while not client.service_is_ready():
+                if time.monotonic() > end:
+                    raise OperatorError(f"{service}: nobody offers this service in namespace {self.get_namespace()}")
+                self.spin(0.05)
+            future = client.call_async(request)
+            while not future.done():
+                if time.monotonic() > end:
+                    raise OperatorError(f"{service}: no answer in {timeout:g} s")
+                self._executor.spin_once(timeout_sec=0.05)
+            return future.result()
+        finally:
+            self.destroy_client(client)
+
+    def ready(self, kind: Any, service: str) -> bool:
+        """Whether somebody offers a service now."""
+        client = self.create_client(kind, service)
+        self.spin(0.1)
+        there = client.service_is_ready()
+        self.destroy_client(client)
+        return there
+
+    def transition(self, name: str) -> None:
+        """A lifecycle transition of the HRTC: a key of TRANSITIONS.
+
+        Raises:
+            OperatorError: it failed; the node's log says why.
+        """
+        request = ChangeState.Request(transition=Transition(id=TRANSITIONS[name]))
+        if not self.call(ChangeState, "hrtc/change_state", request, timeout=30.0).success:
+            raise OperatorError(f"{name}: the HRTC refused or failed; its log says why")
+
+    def close_loop(self, closed: bool) -> None:
+        """Close or open the loop.
+
+        Raises:
+            OperatorError: refused.
+        """
+        response = self.call(SetBool, "hrtc/close_loop", SetBool.Request(data=closed))
+        if not response.success:
+            raise OperatorError(f"hrtc/close_loop: {response.message}")
+
+    def start_sim(self) -> None:
+        """Let the simulated plant publish its first frame."""
+        self.call(Trigger, "sim/start", Trigger.Request())
+
+    def publish(self, label: str) -> tuple[int, bytes]:
+        """Have the SRTC publish a reconstructor by its label: its id and SHA-256.
+
+        Raises:
+            OperatorError: the SRTC has none of that label.
+        """
+        response = self.call(PublishReconstructor, "srtc/publish", PublishReconstructor.Request(label=label))
+        if not response.success:
+            raise OperatorError(f"srtc/publish: {response.message}")
+        return int(response.id), bytes(response.sha256)
+
+    def wait_staged(self, identity: int, timeout: float = 15.0) -> None:
+        """Wait until the HRTC has a reconstructor staged.
+
+        Raises:
+            OperatorError: it has not in time.
+        """
+        end = time.monotonic() + timeout
+        while self.hrtc is None or self.hrtc.staged != identity:
+            if time.monotonic() > end:
+                raise OperatorError(f"reconstructor {identity:016x} was not staged in {timeout:g} s; the HRTC's log says why")
+            self.spin(0.05)
+
+    def commit(self, identity: int, sha256: bytes, roll_back: bool = False) -> int:
+        """Commit the staged reconstructor, or roll back to the previous one: the first frame made by it.
+
+        Raises:
+            OperatorError: refused.
+        """
+        service = "hrtc/roll_back" if roll_back else "hrtc/commit"
+        request = SwapReconstructor.Request(id=identity, sha256=list(sha256))
+        response = self.call(SwapReconstructor, service, request)
+        if not response.success:
+            raise OperatorError(f"{service}: {response.message}")
+        return int(response.first_frame)

@@ -1,0 +1,81 @@
+"""Arguments that several sub-commands share, and the JSON that those with numbers write."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+from srtomo_core.system import InstrumentError, System, load_system
+
+
+def add_system(parser: argparse.ArgumentParser, default: str | None = None) -> None:
+    """``SYSTEM`` and ``--set KEY=VALUE``."""
+    text = "name (see 'srtomo systems') or path of a .yaml file"
+    if default is None:
+        parser.add_argument("system", metavar="SYSTEM", help=text)
+    else:
+        parser.add_argument("system", metavar="SYSTEM", nargs="?", default=default, help=f"{text} (default: {default})")
+    parser.add_argument(
+        "--set",
+        metavar="KEY=VALUE",
+        action="append",
+        default=[],
+        help="change the instrument, with unit, e.g. --set 'loop.rate=1 kHz' --set 'sensors.*.photons=3e5 e/m2/s'",
+    )
+
+
+def changes_of(options: argparse.Namespace) -> dict[str, Any]:
+    """``--set`` as dotted keys.
+
+    Raises:
+        InstrumentError: not of the form KEY=VALUE.
+    """
+    changes: dict[str, Any] = {}
+    for item in options.set:
+        key, separator, value = item.partition("=")
+        if not separator or not key:
+            raise InstrumentError(f"--set {item}: expected KEY=VALUE")
+        try:
+            changes[key] = json.loads(value)
+        except json.JSONDecodeError:
+            changes[key] = value
+    return changes
+
+
+def system_of(options: argparse.Namespace) -> System:
+    """The instrument that ``SYSTEM`` and ``--set`` describe."""
+    return load_system(options.system, changes_of(options))
+
+
+def add_json(parser: argparse.ArgumentParser) -> None:
+    """``--json FILE``."""
+    parser.add_argument("--json", metavar="FILE", type=Path, help="write the numbers to FILE as JSON")
+
+
+def write_json(path: Path | None, content: dict[str, Any]) -> None:
+    """Write ``content``, if a path was given.
+
+    Raises:
+        ValueError: the file cannot be written.
+    """
+    if path is None:
+        return
+    try:
+        path.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+    except OSError as error:
+        raise ValueError(f"{path}: {error.strerror or error}") from None
+
+
+def writable_file(path: Path) -> Path:
+    """A path that something will be written to, checked before any work.
+
+    Raises:
+        ValueError: its folder does not exist, or it is a folder.
+    """
+    if not path.parent.is_dir():
+        raise ValueError(f"{path}: no such folder")
+    if path.is_dir():
+        raise ValueError(f"{path}: is a folder")
+    return path

@@ -1,0 +1,100 @@
+"""The loop in lockstep without ROS: the HRTC's own control law against the simulated plant, the same every run."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from srtomo_core.layout import Layout
+from srtomo_core.reconstructor import Reconstructor
+from srtomo_rtc.loop import Loop, Program, Settings, Slot, Verdict
+from srtomo_sim.plant import Plant
+
+SETTLING = 50
+"""Frames left out of the statistics by default: the loop starts from a flat mirror."""
+
+
+class Run(NamedTuple):
+    """Residuals of a run, one row a science frame.
+
+    Attributes:
+        frames: (n,) exposure numbers.
+        high_order: (n, n_targets) m rms, piston and tip-tilt removed.
+        tip_tilt: (n, n_targets) m rms of tip and tilt.
+    """
+
+    frames: NDArray[np.int64]
+    high_order: NDArray[np.float64]
+    tip_tilt: NDArray[np.float64]
+
+    def wfe(self, settling: int = SETTLING) -> float:
+        """Rms over time of the first target's high-order residual after ``settling`` frames, m."""
+        return float(np.sqrt(np.mean(self.high_order[self.frames >= settling, 0] ** 2)))
+
+
+def program_of(layout: Layout, reconstructor: Reconstructor, settings: Settings | None = None) -> Program:
+    """A program that runs a reconstructor under plain settings."""
+    slot = Slot(layout)
+    slot.fill(
+        reconstructor.R[0],
+        reconstructor.Q[0],
+        reconstructor.slope_reference,
+        reconstructor.command_limit,
+        reconstructor.gain,
+        reconstructor.sha256,
+    )
+    return Program(slot, settings or plain_settings(layout))
+
+
+def plain_settings(layout: Layout, leak: float = 0.0) -> Settings:
+    """Pseudo-open-loop control, no offset, no limit but the mirrors' stroke."""
+    return Settings(
+        id=1,
+        offset=np.zeros(layout.n_commands, np.float32),
+        slope_reference=np.zeros(layout.n_slopes, np.float32),
+        leak=leak,
+    )
+
+
+def run(
+    plant: Plant,
+    programs: dict[int, Program],
+    *,
+    frames: int | None = None,
+    closed: bool = True,
+    each: Callable[[int], None] = lambda frame: None,
+) -> Run:
+    """Close the loop over a plant that has not run yet.
+
+    Args:
+        programs: what the loop runs, by the first frame it is to make; the first is for frame 0.
+        frames: how many; by default all that the sky was prepared for.
+        closed: False leaves the mirrors flat.
+        each: called with every frame's number after it.
+    """
+    sky = plant.sky
+    loop = Loop(sky.layout, sky.system.loop.delay)
+    loop.post(programs[0])
+    loop.prepare()
+    loop.request(closed)
+    rows = []
+    for k in range(sky.n_frames if frames is None else frames):
+        if k in programs:
+            loop.post(programs[k])
+        loop.prepare()
+        slopes = plant.measure(k)
+        on = plant.on_mirror(k)
+        if k % sky.science_every == 0:
+            error = plant.wfe(k)
+            rows.append((k, error.high_order, error.tip_tilt))
+        for w in range(loop.n_sensors):
+            loop.add(w, slopes[sky.layout.slopes_of(w)])
+        verdict = loop.answer(on.frame, on.before, on.fraction)
+        assert verdict in (Verdict.OK, Verdict.OPEN)
+        plant.command(k, loop.command)
+        each(k)
+    numbers, high_order, tip_tilt = zip(*rows, strict=True)
+    return Run(np.array(numbers), np.array(high_order), np.array(tip_tilt))
