@@ -40,7 +40,7 @@ CHUNK_SIZE = 1 << 20
 """Bytes gathered before they are compressed and written; what a killed recorder can lose."""
 
 
-class BagError(Exception):
+class BagError(ValueError):
     """A bag that cannot be written, read or mended; one line that says why."""
 
 

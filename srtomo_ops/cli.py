@@ -42,6 +42,10 @@ GROUPS: dict[str, tuple[Command, ...]] = {
     ),
 }
 
+# Nodes talk over shared memory alone unless the user says otherwise: ROS 2's discovery has no authentication, and even
+# its range LOCALHOST binds sockets to every interface.
+_LOCAL = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "FASTDDS_BUILTIN_TRANSPORTS": "SHM"}
+
 _THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 
 
@@ -82,6 +86,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     # one BLAS thread beats two on busy cores, and has to be asked for before numpy loads
     for variable in _THREADS:
         os.environ.setdefault(variable, "1")
+    if not any(variable in os.environ for variable in _LOCAL):
+        os.environ.update(_LOCAL)
     module = importlib.import_module(f"srtomo_ops.commands.{command.module or command.name}")
     parser = argparse.ArgumentParser(
         prog=f"srtomo {command.name}",

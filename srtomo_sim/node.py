@@ -126,7 +126,7 @@ class SimNode(Node):
         self.frame = -1
         self._published_at = 0.0
         self._slipped = 0.0
-        self._errors: list[tuple[int, list[float], list[float]]] = []
+        self._errors: list[tuple[int, list[float], list[float], list[float]]] = []
         self._reported = 0
         self._last_report = (time.monotonic(), -1)
         self.create_timer(0.1, self._report)
@@ -234,7 +234,9 @@ class SimNode(Node):
     def _look(self, frame: int) -> None:
         if frame % self._values["science_every"] == 0:
             error = self._plant.wfe(frame)
-            self._errors.append((frame, error.high_order.tolist(), error.tip_tilt.tolist()))
+            index = frame // self._values["science_every"]
+            uncorrected = [float(np.sqrt(target.power[index])) for target in self._plant.sky.targets]
+            self._errors.append((frame, error.high_order.tolist(), error.tip_tilt.tolist(), uncorrected))
 
     def _sleep_until(self, moment: float) -> None:
         left = moment - time.monotonic()
@@ -243,12 +245,13 @@ class SimNode(Node):
 
     def _save(self) -> None:
         if self._values["result"] and self._errors:
-            frames, high_order, tip_tilt = (np.array(column) for column in zip(*self._errors, strict=True))
+            frames, high_order, tip_tilt, uncorrected = (np.array(column) for column in zip(*self._errors, strict=True))
             np.savez(
                 self._values["result"],
                 frame=frames,
                 high_order=high_order,
                 tip_tilt=tip_tilt,
+                uncorrected=uncorrected,
                 late_commands=self._plant.late_commands,
                 slipped=self._slipped,
                 frames=self.frame + 1,

@@ -33,7 +33,7 @@ def main(options: argparse.Namespace) -> int:
         seconds = (last - first) * 1e-9
         print(f"{options.bag}: {reader.message_count} messages in {seconds:.1f} s")
         if reader.cut:
-            print(f"cut off: {reader.cut}")
+            print(reader.cut)
         for topic, kind in reader.topics.items():
             print(f"  {reader.counts[topic]:>8}  {topic:<32} {kind}")
         write_json(

@@ -27,4 +27,4 @@ def main(options: argparse.Namespace) -> int:
     report = run(options.output, system, namespace=options.namespace, topics=options.topics)
     print(table(report))
     write_json(options.json, report)
-    return 0
+    return 1 if report["lost"] else 0

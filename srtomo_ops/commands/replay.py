@@ -40,7 +40,7 @@ def main(options: argparse.Namespace) -> int:
     """Run the command."""
     with BagReader(options.bag) as reader:
         if reader.cut:
-            print(f"cut off: {reader.cut}")
+            print(reader.cut)
         if options.publish:
             from srtomo_ops.publish import publish_slopes
 

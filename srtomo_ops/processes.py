@@ -1,0 +1,84 @@
+"""The nodes as processes: started together, watched, and always ended."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from types import TracebackType
+
+
+class NodeError(ValueError):
+    """A node that ended before its time; one line with the last thing it said."""
+
+
+class Processes:
+    """``with Processes(folder) as nodes: nodes.start("hrtc", [...])``; leaving ends whatever still runs.
+
+    Args:
+        folder: where each node's output goes, as NAME.log.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._running: dict[str, subprocess.Popen[bytes]] = {}
+
+    def start(self, name: str, words: list[str]) -> None:
+        """Start ``srtomo WORDS...`` under a name."""
+        with open(self.log(name), "wb") as log:
+            # a session of its own: Ctrl-C goes to the supervisor, which ends the nodes in order
+            self._running[name] = subprocess.Popen(
+                [sys.executable, "-m", "srtomo_ops.cli", *words],
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,
+                env={**os.environ, "PYTHONUNBUFFERED": "1"},
+            )
+
+    def log(self, name: str) -> Path:
+        """A node's output."""
+        return self._folder / f"{name}.log"
+
+    def last_line(self, name: str) -> str:
+        """The last line that a node wrote, or an empty one."""
+        lines = self.log(name).read_text(errors="replace").split("\n")
+        return next((line for line in reversed(lines) if line.strip()), "")
+
+    def check(self) -> None:
+        """Raise if a node has ended.
+
+        Raises:
+            NodeError: names it, with its last line.
+        """
+        for name, process in self._running.items():
+            code = process.poll()
+            if code is not None:
+                raise NodeError(f"{name} ended with exit code {code}: {self.last_line(name)} (see {self.log(name)})")
+
+    def stop(self, name: str, patience: float = 30.0) -> int:
+        """End a node with SIGINT, and wait; SIGKILL when its patience is over. Its exit code."""
+        process = self._running.pop(name)
+        if process.poll() is None:
+            process.send_signal(signal.SIGINT)
+        try:
+            return process.wait(patience)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            return process.wait()
+
+    def __enter__(self) -> Processes:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        for process in self._running.values():
+            if process.poll() is None:
+                process.send_signal(signal.SIGINT)
+        end = time.monotonic() + 10
+        for name in list(self._running):
+            self.stop(name, max(0.1, end - time.monotonic()))
