@@ -78,7 +78,7 @@ _PARAMETERS: tuple[tuple[str, Any, ParameterDescriptor], ...] = (
     ("reconstructor", "", _read_only("path of a reconstructor to start with; empty: wait for one on the wire")),
     ("keep", "", _read_only("path where the last committed reconstructor is kept for a restart; empty: nowhere")),
     ("max_behind", 4, _integer("complete frames that may wait before whole frames are skipped", 1, 7, True)),
-    ("fifo_priority", 0, _integer("SCHED_FIFO priority of the loop's thread; 0: normal scheduling", 0, 99, True)),
+    ("fifo_priority", 0, _integer("SCHED_FIFO priority of the process; 0: normal scheduling", 0, 99, True)),
     ("deadline", 0.0, _read_only("latency above which a frame is a miss, s; 0: the loop's delay less one exposure")),
     ("polc", True, ParameterDescriptor(description="pseudo-open-loop control; false: classical leaky integrator")),
     ("leak", 0.0, _number("leak of a frame; 0 at configure: the instrument's", 0.0, 0.999)),
@@ -216,7 +216,12 @@ class HrtcNode(LifecycleNode):
         self._swap = Swap(system, layout, G_cal, settings, self._post)
         self._layout = layout
         self._load_first()
-        self._realtime = [_BLAS, realtime.lock_memory(), realtime.quiet_interpreter()]
+        self._realtime = [
+            _BLAS,
+            realtime.lock_memory(),
+            realtime.quiet_interpreter(),
+            realtime.fifo_priority(self._value("fifo_priority")),
+        ]
         # a manifest and blocks may have come while there was no memory for them
         if self._manifest is not None:
             self._begin(self._manifest)
@@ -271,7 +276,6 @@ class HrtcNode(LifecycleNode):
         """Wait, take, answer, until told to stop. The loop's thread."""
         hrtc, hot = self._hrtc, self._hot
         assert hrtc is not None and hot is not None
-        self._realtime.append(realtime.fifo_priority(self._value("fifo_priority")))
         try:
             with hot:
                 while not self._stop.is_set():

@@ -82,7 +82,7 @@ def test_off_axis_stars_look_at_another_part_of_high_layers(mini: System) -> Non
 def test_gradient_averages_over_square_and_exposure(mini: System, rotation: float) -> None:
     """Against mean differences between opposite edges of the square, at many moments of the exposure.
 
-    The surface itself differs from a band-limited one by its grid's step: by 0.6 % of the gradient at 5 cm, 0.2 % at 2.5.
+    A surface of splines is not quite band-limited: 0.6 % of the gradient at steps of 5 cm, 0.2 % at 2.5 cm.
     """
     system = mini.with_changes({"loop.rate": 20.0})
     screens = Screens(system, 2)
