@@ -40,7 +40,10 @@ class Direction(_Frozen):
     def _from_polar(cls, value: Any) -> Any:
         if isinstance(value, Mapping) and set(value) == {"radius", "angle"}:
             polar = _Polar.model_validate(value, context={"from_file": isinstance(value["radius"], str)})
-            return {"x": f"{polar.radius * math.cos(polar.angle)!r} rad", "y": f"{polar.radius * math.sin(polar.angle)!r} rad"}
+            return {
+                "x": f"{polar.radius * math.cos(polar.angle)!r} rad",
+                "y": f"{polar.radius * math.sin(polar.angle)!r} rad",
+            }
         return value
 
 
@@ -250,9 +253,9 @@ class System(_Frozen):
     @property
     def theta0(self) -> float:
         """Isoplanatic angle along the line of sight at 500 nm, rad: 0.314 r0 / hbar."""
-        moment = sum(
-            f * h ** (5 / 3) for f, h in zip(self.atmosphere.fractions, self.los_heights, strict=True)
-        ) ** (3 / 5)
+        moment = sum(f * h ** (5 / 3) for f, h in zip(self.atmosphere.fractions, self.los_heights, strict=True)) ** (
+            3 / 5
+        )
         return math.inf if moment == 0 else 0.314 * self.los_r0 / moment
 
     @property
@@ -373,9 +376,7 @@ def load_system(name: str | Path, changes: Mapping[str, Any] | None = None) -> S
         text = (resources.files("srtomo_core") / "systems" / f"{text_name}.yaml").read_text(encoding="utf-8")
         source = f"{text_name}.yaml"
     else:
-        raise InstrumentError(
-            f"{text_name}: expected the path of a .yaml file or one of {', '.join(system_names())}"
-        )
+        raise InstrumentError(f"{text_name}: expected the path of a .yaml file or one of {', '.join(system_names())}")
     try:
         tree = yaml.safe_load(text)
     except yaml.YAMLError as error:

@@ -125,11 +125,14 @@ class DmCommand(NamedTuple):
 
 
 class ReconstructorBlock(NamedTuple):
-    """A ReconstructorBlock as read; ``rows`` is a read-only view of the buffer. Fields as in msgs_schema/msg."""
+    """A ReconstructorBlock as read; ``rows`` is a read-only view of the buffer.
+
+    Fields as in msgs_schema/msg, but for ``number``, which is ``index`` there.
+    """
 
     id: int
     sha256: bytes
-    index: int
+    number: int
     epoch: int
     matrix: int
     first_row: int
@@ -177,7 +180,7 @@ def read_slope_frame(buffer: bytes) -> SlopeFrame:
     sec, nanosec = _STAMP.unpack_from(buffer, 4)
     *fields, count = _SLOPES.unpack_from(buffer, start)
     slopes = _read_floats(buffer, start + _SLOPES.size, count)
-    frame = SlopeFrame(sec, nanosec, *fields, slopes)
+    frame = SlopeFrame._make((sec, nanosec, *fields, slopes))
     if count != 2 * frame.n_subapertures:
         raise WireError(f"{frame.n_subapertures} sub-apertures announced with {count} slopes")
     return frame
@@ -192,7 +195,7 @@ def read_dm_command(buffer: bytes) -> DmCommand:
     start = _read_header(buffer, _COMMAND)
     sec, nanosec = _STAMP.unpack_from(buffer, 4)
     *fields, count = _COMMAND.unpack_from(buffer, start)
-    return DmCommand(sec, nanosec, *fields, _read_floats(buffer, start + _COMMAND.size, count))
+    return DmCommand._make((sec, nanosec, *fields, _read_floats(buffer, start + _COMMAND.size, count)))
 
 
 def read_block(buffer: bytes) -> ReconstructorBlock:
@@ -206,7 +209,8 @@ def read_block(buffer: bytes) -> ReconstructorBlock:
     *fields, n_rows, n_columns, count = _BLOCK.unpack_from(buffer, 4)
     if count != n_rows * n_columns:
         raise WireError(f"{n_rows} x {n_columns} announced with {count} floats")
-    return ReconstructorBlock(*fields, _read_floats(buffer, 4 + _BLOCK.size, count).reshape(n_rows, n_columns))
+    rows = _read_floats(buffer, 4 + _BLOCK.size, count).reshape(n_rows, n_columns)
+    return ReconstructorBlock._make((*fields, rows))
 
 
 def write_block(block: ReconstructorBlock) -> bytes:

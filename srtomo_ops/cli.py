@@ -107,7 +107,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except ModuleNotFoundError as error:
         if error.name is None or error.name.split(".")[0] not in ("rclpy", "msgs_schema"):
             raise
-        print(f"srtomo {command.name}: needs ROS 2 ({error.name} is missing): pip install 'srtomo[ros]'", file=sys.stderr)
+        print(
+            f"srtomo {command.name}: needs ROS 2 ({error.name} is missing): pip install 'srtomo[ros]'", file=sys.stderr
+        )
         return 2
     except ValueError as error:
         # every error of bad input in srtomo is a ValueError of one line

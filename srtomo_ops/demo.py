@@ -22,7 +22,6 @@ from rich.text import Text
 
 from srtomo_core.system import System
 from srtomo_ops.commands.calibrate import calibrate
-from srtomo_ops.commands.nodes import ros_arguments
 from srtomo_ops.operator import Operator, OperatorError
 from srtomo_ops.processes import Processes
 from srtomo_ops.report import demo_figure
@@ -79,7 +78,8 @@ class _Screen:
         if sim is None or hrtc is None or sim.rate <= 0:
             return self.stage
         return (
-            f"frame {sim.frame + 1}/{self.frames}  {sim.rate:.0f} Hz  WFE {sim.wfe * 1e9:.0f} nm  Strehl {sim.strehl:.2f}  "
+            f"frame {sim.frame + 1}/{self.frames}  {sim.rate:.0f} Hz  "
+            f"WFE {sim.wfe * 1e9:.0f} nm  Strehl {sim.strehl:.2f}  "
             f"latency {hrtc.latency_p50 * 1e6:.0f}/{hrtc.latency_p99 * 1e6:.0f} us  {self.active}"
         )
 
@@ -321,8 +321,10 @@ def summary(numbers: dict[str, Any]) -> Table:
         ("frames", f"{numbers['frames']} published, {numbers['frames_answered']} answered, "
                    f"{numbers['frames_recorded']} recorded, {numbers['frames_lost']} lost"),
         ("WFE, no correction", f"{numbers['wfe_nm_open']:.0f} nm"),
-        ("WFE before the swap", f"{numbers['wfe_nm_before']:.1f} nm, Strehl {numbers['strehl_before']:.3f}: {_WHY[BEFORE]}"),
-        ("WFE after the swap", f"{numbers['wfe_nm_after']:.1f} nm, Strehl {numbers['strehl_after']:.3f}: {_WHY[AFTER]}"),
+        ("WFE before the swap",
+         f"{numbers['wfe_nm_before']:.1f} nm, Strehl {numbers['strehl_before']:.3f}: {_WHY[BEFORE]}"),
+        ("WFE after the swap",
+         f"{numbers['wfe_nm_after']:.1f} nm, Strehl {numbers['strehl_after']:.3f}: {_WHY[AFTER]}"),
         ("swap", f"at frame {numbers['swap_frame']}"),
         ("latency", f"p50 {latency['p50']:.0f}, p99 {latency['p99']:.0f}, p99.9 {latency['p999']:.0f}, "
                     f"max {latency['max']:.0f} us, last slopes to command"),

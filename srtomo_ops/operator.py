@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from functools import partial
 from typing import Any
 
 from lifecycle_msgs.msg import Transition
@@ -47,12 +48,7 @@ class Operator(Node):
             (wire.RECORDER_STATUS, RecorderStatus, "recorder"),
             (wire.SIM_STATUS, SimStatus, "sim"),
         ):
-            self.create_subscription(
-                kind,
-                topic.name,
-                lambda message, attribute=attribute: setattr(self, attribute, message),
-                QoSProfile(**topic.qos()),
-            )
+            self.create_subscription(kind, topic.name, partial(setattr, self, attribute), QoSProfile(**topic.qos()))
 
     def spin(self, seconds: float) -> None:
         """Take messages for a while."""
@@ -134,7 +130,9 @@ class Operator(Node):
         end = time.monotonic() + timeout
         while self.hrtc is None or self.hrtc.staged != identity:
             if time.monotonic() > end:
-                raise OperatorError(f"reconstructor {identity:016x} was not staged in {timeout:g} s; the HRTC's log says why")
+                raise OperatorError(
+                    f"reconstructor {identity:016x} was not staged in {timeout:g} s; the HRTC's log says why"
+                )
             self.spin(0.05)
 
     def commit(self, identity: int, sha256: bytes, roll_back: bool = False) -> int:

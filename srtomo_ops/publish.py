@@ -29,7 +29,9 @@ def publish_slopes(reader: BagReader, namespace: str = "", start: int = 0) -> in
         end = time.monotonic() + _WAIT
         while publisher.get_subscription_count() == 0:
             if time.monotonic() > end:
-                raise ValueError(f"nobody reads {wire.SLOPES.name} in namespace {node.get_namespace()}: is an HRTC running?")
+                raise ValueError(
+                    f"nobody reads {wire.SLOPES.name} in namespace {node.get_namespace()}: is an HRTC running?"
+                )
             time.sleep(0.05)
         time.sleep(0.5)  # let the reader's side match too
         count, offset = 0, 0.0

@@ -1,7 +1,7 @@
 """The hot endpoints: raw slopes in, raw commands out, on a node that no executor spins.
 
-An executor would take most of their messages itself. Waiting is behind :class:`HotEndpoints.wait` alone, so that another
-way of waiting (polling, or out of the interpreter) changes nothing else.
+An executor would take most of their messages itself. Waiting is behind :class:`HotEndpoints.wait` alone, so that
+another way of waiting (polling, or out of the interpreter) changes nothing else.
 """
 
 from __future__ import annotations

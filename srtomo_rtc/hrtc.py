@@ -174,10 +174,11 @@ class Hrtc:
             return False
         if n == 1:
             return (
-                message.n_subapertures > 0
-                and message.first_subaperture + message.n_subapertures <= self._counts[first]
+                message.n_subapertures > 0 and message.first_subaperture + message.n_subapertures <= self._counts[first]
             )
-        return message.first_subaperture == 0 and message.n_subapertures == self._starts[first + n] - self._starts[first]
+        return (
+            message.first_subaperture == 0 and message.n_subapertures == self._starts[first + n] - self._starts[first]
+        )
 
     def _begin(self, session: int, frame: int) -> None:
         for place in range(_AHEAD):

@@ -1,7 +1,7 @@
 """The control law, a frame at a time: no ROS, no allocation, no lock.
 
-Pseudo-open-loop control. The mirror shows ``m = clip(u + o)``; the state is ``u = m - o``, so clipping acts on the state
-and there is no wind-up. With ``m~[k]`` what was on the mirror during exposure k, ``u~[k] = m~[k] - o`` and ``Q = R G``::
+Pseudo-open-loop control. The mirror shows ``m = clip(u + o)``; the state is ``u = m - o``, so clipping acts on the
+state and there is no wind-up. With ``m~[k]`` on the mirror during exposure k, ``u~[k] = m~[k] - o`` and ``Q = R G``::
 
     after command k-1 is out:      c = (1-leak) (1-g) u[k-1] + g (Q u~[k] - R y_ref)
     as each sensor's slopes come:  p_w = R_w y_w

@@ -431,9 +431,7 @@ class HrtcNode(LifecycleNode):
         try:
             program = self._worker.submit(action, request.id, bytes(request.sha256)).result()
         except Refused as error:
-            self._event(
-                HrtcEvent.REFUSED, text=str(error), reconstructor=(request.id, bytes(request.sha256))
-            )
+            self._event(HrtcEvent.REFUSED, text=str(error), reconstructor=(request.id, bytes(request.sha256)))
             response.message = str(error)
             return response
         assert swap.active is not None
@@ -642,7 +640,7 @@ class HrtcNode(LifecycleNode):
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the node until SIGINT or SIGTERM. ``arguments``: ROS arguments (``--ros-args -p system:=mini ...``)."""
     # rclpy's own handlers shut the context first, after which flat could not be published any more
-    rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
+    rclpy.init(args=None if arguments is None else list(arguments), signal_handler_options=SignalHandlerOptions.NO)
     stop = threading.Event()
 
     def on_signal(number: int, frame: FrameType | None) -> None:

@@ -1,4 +1,4 @@
-"""A bag through the same loop: recorded slopes, reconstructors, settings and transitions in, commands compared bit for bit.
+"""A bag through the same loop: what was recorded goes in, and commands are compared bit for bit.
 
 What depended on time in the running loop is taken from the record: which frames were held because messages were missing
 or late, and at which frame each setting, transition and swap took effect. All else, non-finite slopes and an unknown
@@ -118,7 +118,7 @@ class Replay:
         blocks: dict[bytes, dict[int, wire.ReconstructorBlock]] = {}
         for data in self._of(wire.RECONSTRUCTOR_BLOCK):
             block = wire.read_block(data)
-            blocks.setdefault(block.sha256, {})[block.index] = block
+            blocks.setdefault(block.sha256, {})[block.number] = block
         for sha256, message in manifests.items():
             table = block_table(message.n_commands, message.n_epochs)
             if len(blocks.get(sha256, {})) == len(table) and message.n_slopes == self.layout.n_slopes:
@@ -138,7 +138,9 @@ class Replay:
                 self._events.append(decode(wire.EVENT.type, data))
         for event in self._events:
             if event.kernel and event.kernel != KERNEL:
-                raise BagError(f"{self._reader.path}: made with kernel {event.kernel}, this is {KERNEL}: bits would differ")
+                raise BagError(
+                    f"{self._reader.path}: made with kernel {event.kernel}, this is {KERNEL}: bits would differ"
+                )
         self.delay = next((float(e.delay) for e in self._events if e.delay > 0), self.system.loop.delay)
         for data in self._of(wire.STATE):
             state = decode(wire.STATE.type, data)
@@ -232,7 +234,7 @@ class Replay:
 
 
 def _name(verdict: int) -> str:
-    return Verdict(verdict).name if verdict in iter(Verdict) else str(verdict)
+    return Verdict(verdict).name if verdict in list(Verdict) else str(verdict)
 
 
 def _filled(
@@ -395,9 +397,7 @@ class _Session:
         outcome.held += loop.verdict not in (Verdict.OK, Verdict.OPEN)
         identity = loop.program.slot.id if loop.program is not None else 0
         if command.verdict != loop.verdict:
-            outcome.note_difference(
-                self._frame, f"verdict {_name(command.verdict)} recorded, {loop.verdict.name} now"
-            )
+            outcome.note_difference(self._frame, f"verdict {_name(command.verdict)} recorded, {loop.verdict.name} now")
         elif command.reconstructor != identity:
             outcome.note_difference(
                 self._frame, f"reconstructor {command.reconstructor:016x} recorded, {identity:016x} now"

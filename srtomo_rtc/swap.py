@@ -2,8 +2,8 @@
 
 A reconstructor comes as a manifest and row blocks. Shapes are checked against the instrument before memory is touched;
 when the last row is in, the whole is checked (:meth:`Swap.check`), copied into the slot that the loop does not use, and
-touched until warm. Nothing reaches the loop before :meth:`Swap.commit`, which posts one reference. There are three slots:
-active, staged and previous.
+touched until warm. Nothing reaches the loop before :meth:`Swap.commit`, which posts one reference. There are three
+slots: active, staged and previous.
 
 Threads: one thread at a time, any but the loop's, calls everything here; the node keeps them on one executor thread.
 """
@@ -238,9 +238,9 @@ class Swap:
             Refused: its shape is not what the table says; the transfer is forgotten.
         """
         manifest = self._manifest
-        if manifest is None or block.sha256 != manifest.sha256 or block.index not in self._waiting:
+        if manifest is None or block.sha256 != manifest.sha256 or block.number not in self._waiting:
             return False
-        epoch, matrix, first, rows = self._table[block.index]
+        epoch, matrix, first, rows = self._table[block.number]
         target = self._R if matrix == 0 else self._Q
         if (block.epoch, block.matrix, block.first_row, block.rows.shape) != (
             epoch,
@@ -249,9 +249,9 @@ class Swap:
             (rows, target.shape[1]),
         ):
             self._manifest = None
-            raise Refused(f"block {block.index}: expected {rows} rows x {target.shape[1]}, got {block.rows.shape}")
+            raise Refused(f"block {block.number}: expected {rows} rows x {target.shape[1]}, got {block.rows.shape}")
         target[first : first + rows] = block.rows
-        self._waiting.remove(block.index)
+        self._waiting.remove(block.number)
         return not self._waiting
 
     @property

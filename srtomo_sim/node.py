@@ -297,7 +297,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     ``arguments``: ROS arguments (``--ros-args -p system:=mini ...``).
     """
-    rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
+    rclpy.init(args=None if arguments is None else list(arguments), signal_handler_options=SignalHandlerOptions.NO)
     stop = threading.Event()
 
     def on_signal(number: int, frame: FrameType | None) -> None:

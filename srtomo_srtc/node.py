@@ -33,7 +33,8 @@ from rclpy.signals import SignalHandlerOptions
 from srtomo_core import wire
 from srtomo_core.reconstructor import Reconstructor, block_table
 from srtomo_core.system import InstrumentError, System, load_system
-from srtomo_srtc.reconstructors.implicit import ground_prior, implicit
+from srtomo_srtc.model import ground_prior
+from srtomo_srtc.reconstructors import implicit
 
 PRIORS: dict[str, Callable[[System], System]] = {"file": lambda system: system, "ground": ground_prior}
 """What a reconstructor may suppose of the sky: the instrument file's profile, or all turbulence at the ground."""
@@ -89,13 +90,16 @@ class SrtcNode(Node):
     def _publish(
         self, request: PublishReconstructor.Request, response: PublishReconstructor.Response
     ) -> PublishReconstructor.Response:
-        for label, (believed, reconstructor) in self._built.items():
-            if request.label == label or (not request.label and request.id == reconstructor.id):
-                break
-        else:
+        found = [
+            (label, believed, reconstructor)
+            for label, (believed, reconstructor) in self._built.items()
+            if request.label == label or (not request.label and request.id == reconstructor.id)
+        ]
+        if not found:
             wanted = request.label or f"{request.id:016x}"
             response.message = f"no reconstructor {wanted!r} here, only {', '.join(self._built) or 'none yet'}"
             return response
+        label, believed, reconstructor = found[0]
         if request.blocks:
             self._send_blocks(reconstructor, set(request.blocks))
         else:
@@ -158,7 +162,7 @@ class SrtcNode(Node):
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Build, then serve until SIGINT or SIGTERM. ``arguments``: ROS arguments (``--ros-args -p system:=mini ...``)."""
-    rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
+    rclpy.init(args=None if arguments is None else list(arguments), signal_handler_options=SignalHandlerOptions.NO)
     stop = threading.Event()
 
     def on_signal(number: int, frame: FrameType | None) -> None:

@@ -36,6 +36,11 @@ def main(options: argparse.Namespace) -> int:
     print(f"{options.output}: {layout.n_slopes} slopes x {layout.n_commands} commands, rad/m")
     write_json(
         options.json,
-        {"system": system.name, "slopes": layout.n_slopes, "commands": layout.n_commands, "output": str(options.output)},
+        {
+            "system": system.name,
+            "slopes": layout.n_slopes,
+            "commands": layout.n_commands,
+            "output": str(options.output),
+        },
     )
     return 0

@@ -12,7 +12,7 @@ _MODULES = {"hrtc": "srtomo_rtc.node", "srtc": "srtomo_srtc.node", "sim": "srtom
 
 EXAMPLE = """example:
   srtomo COMMAND gnao_ltao_sr --namespace gnao -p NAME:=VALUE
-every parameter of the node can be given with -p; 'srtomo COMMAND SYSTEM --parameters' lists them with units and defaults
+every parameter of the node can be given with -p; 'srtomo COMMAND SYSTEM --parameters' lists them with defaults
 """
 
 

@@ -8,7 +8,8 @@ from pathlib import Path
 
 from srtomo_ops.options import add_json, add_system, system_of, writable_file, write_json
 from srtomo_ops.progress import Progress
-from srtomo_srtc.reconstructors.implicit import ground_prior, implicit
+from srtomo_srtc.model import ground_prior
+from srtomo_srtc.reconstructors import implicit
 
 EXAMPLE = "example:\n  srtomo reconstruct gnao_ltao_sr -o sr.npz"
 

@@ -14,7 +14,8 @@ from srtomo_ops.progress import Progress
 from srtomo_ops.simulate import SETTLING, plain_settings, program_of, run
 from srtomo_sim.plant import Plant
 from srtomo_sim.sky import prepare, strehl
-from srtomo_srtc.reconstructors.implicit import ground_prior, implicit
+from srtomo_srtc.model import ground_prior
+from srtomo_srtc.reconstructors import implicit
 
 EXAMPLE = "example:\n  srtomo simulate gnao_ltao_sr --frames 1000 --seed 2 --set 'loop.rate=1 kHz'"
 
@@ -67,7 +68,9 @@ def main(options: argparse.Namespace) -> int:
         "science_wavelength_m": system.science.wavelength,
         "seconds": time.perf_counter() - start,
     }
-    print(f"{system.name}, {options.frames} frames at {system.loop.rate:g} Hz, seed {options.seed}, first science target")
+    print(
+        f"{system.name}, {options.frames} frames at {system.loop.rate:g} Hz, seed {options.seed}, first science target"
+    )
     print(f"  WFE           {numbers['wfe_nm']:8.1f} nm rms, piston and tip-tilt removed")
     print(f"  tip-tilt      {numbers['tip_tilt_nm']:8.1f} nm rms")
     print(f"  of it fitting {numbers['fitting_nm']:8.1f} nm rms")

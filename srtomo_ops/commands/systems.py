@@ -18,7 +18,9 @@ EXAMPLE = "example:\n  srtomo systems gnao_ltao_sr --json gnao.json"
 def configure(parser: argparse.ArgumentParser) -> None:
     """Arguments of the command."""
     parser.add_argument("system", metavar="NAME", nargs="?", help="name or path of a .yaml file; none: list them all")
-    parser.add_argument("--set", metavar="KEY=VALUE", action="append", default=[], help="change it, e.g. 'loop.rate=1 kHz'")
+    parser.add_argument(
+        "--set", metavar="KEY=VALUE", action="append", default=[], help="change it, e.g. 'loop.rate=1 kHz'"
+    )
     add_json(parser)
 
 

@@ -10,7 +10,7 @@ from srtomo_srtc.atmosphere import METRES_PER_RADIAN, Profile, covariance, struc
 from srtomo_srtc.covariance import Turbulence, slope_covariance, slope_wavefront_covariance
 from srtomo_srtc.geometry import footprints
 from srtomo_srtc.gradient import GradientOperator, gradient_operator
-from srtomo_srtc.reconstructors.implicit import sightlines
+from srtomo_srtc.model import sightlines
 
 
 @pytest.fixture(scope="module")

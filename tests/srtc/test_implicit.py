@@ -15,8 +15,8 @@ from srtomo_srtc.atmosphere import METRES_PER_RADIAN, Profile
 from srtomo_srtc.covariance import Turbulence, slope_covariance, slope_wavefront_covariance, wavefront_covariance
 from srtomo_srtc.geometry import footprints, pupil_grid
 from srtomo_srtc.mirrors import mirror_wavefronts
+from srtomo_srtc.model import ground_prior, noise_prior, sightlines
 from srtomo_srtc.reconstructors import implicit
-from srtomo_srtc.reconstructors.implicit import ground_prior, noise_prior, sightlines
 
 Shape = Callable[[np.ndarray, np.ndarray], np.ndarray]
 

@@ -1,0 +1,78 @@
+"""Commands to wavefronts: the least-squares fit of the mirrors over pupil and science directions (eq. 15-19)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve
+
+from srtomo_core.layout import Layout
+from srtomo_core.system import Direction, System
+from srtomo_srtc.geometry import Footprints, footprints, pupil_grid
+from srtomo_srtc.mirrors import mirror_wavefronts
+
+Array = NDArray[np.float64]
+
+KAPPA = 1e-4
+"""Default regularisation of the fit, relative to the mean square of an influence function over the pupil."""
+
+_POINTS_PER_PITCH = 2  # finer changes the residual by less than 0.05 nm
+
+
+class View(NamedTuple):
+    """One science direction of the fit.
+
+    Attributes:
+        direction: rad.
+        weight: of the direction; all sum to 1.
+        projection: (n_commands, n_points) ``w N^T W``, piston taken out: what turns a wavefront into its share of the
+            normal equations' right-hand side.
+    """
+
+    direction: Direction
+    weight: float
+    projection: Array
+
+
+class Fit:
+    """``F = (sum_i w_i N_i^T W N_i + kappa I)^-1 sum_i w_i N_i^T W``, piston removed (eq. 15-16, with N^T N).
+
+    Attributes:
+        grid: pupil points and their weights W.
+        views: the science directions.
+        normal: (n_commands, n_commands) with kappa in it.
+    """
+
+    def __init__(self, system: System, layout: Layout, kappa: float = KAPPA) -> None:
+        """Set the fit up.
+
+        Args:
+            kappa: relative to the mean square of an influence function over the pupil.
+        """
+        spacing = min(mirror.pitch for mirror in layout.mirrors) / _POINTS_PER_PITCH
+        self.grid = pupil_grid(system.telescope, spacing)
+        total = sum(target.weight for target in system.science.targets)
+        self.views: list[View] = []
+        self.normal = np.zeros((layout.n_commands, layout.n_commands))
+        for target in system.science.targets:
+            modes = mirror_wavefronts(layout, self.grid.x, self.grid.y, target.position)
+            modes -= self.grid.weight @ modes
+            weight = target.weight / total
+            projection = modes.T * (weight * self.grid.weight)
+            self.normal += projection @ modes
+            self.views.append(View(target.position, weight, projection))
+        self.normal[np.diag_indices_from(self.normal)] += kappa * self.normal.trace() / len(self.normal)
+        self._factor = cho_factor(self.normal)
+
+    def footprints(self, heights: Array) -> Iterator[tuple[View, Footprints]]:
+        """Each direction with its pupil points on layers at ``heights`` (n_layers,), m along the line of sight."""
+        for view in self.views:
+            yield view, footprints(self.grid.x, self.grid.y, view.direction, math.inf, heights)
+
+    def solve(self, right: Array) -> Array:
+        """Commands (n_commands, n) from the right-hand side (n_commands, n) of the normal equations."""
+        return cho_solve(self._factor, right)

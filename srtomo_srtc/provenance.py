@@ -1,0 +1,74 @@
+"""Where a reconstructor comes from, and what its making took."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numba
+import numpy as np
+import scipy
+
+from srtomo_core.system import System
+
+
+class Stages:
+    """Names and times of the stages, told to whoever wants to know."""
+
+    def __init__(self, progress: Callable[[str, float], None] | None) -> None:
+        self.seconds: dict[str, float] = {}
+        self._progress = progress
+        self._name = ""
+        self._since = 0.0
+
+    def enter(self, name: str, done: float) -> None:
+        """The stage ``name`` begins, with a share ``done`` (0 to 1) of the whole behind it."""
+        now = time.perf_counter()
+        if self._name:
+            self.seconds[self._name] = round(now - self._since, 3)
+        self._name, self._since = name, now
+        if self._progress is not None:
+            self._progress(name, done)
+
+
+def provenance(system: System, method: str, gain: float, seconds: dict[str, float], **details: Any) -> dict[str, Any]:
+    """What a reconstructor's file says of its origin; JSON values.
+
+    Args:
+        method: how it was made, as ``srtomo reconstruct --method`` calls it.
+        gain: loop gain g whose filter ``g / (2-g)`` the noise prior went through.
+        seconds: of each stage.
+        details: the method's own parameters.
+    """
+    try:
+        own_version = importlib.metadata.version("srtomo")
+    except importlib.metadata.PackageNotFoundError:
+        own_version = "not installed"
+    return {
+        "method": method,
+        "system": system.name,
+        "zenith_angle_rad": system.zenith_angle,
+        "atmosphere": system.atmosphere.model_dump(mode="json"),
+        "noise": {
+            "gain": gain,
+            "variance_factor": gain / (2 - gain),
+            "rate_hz": system.loop.rate,
+            "sensors": {
+                sensor.name: sensor.model_dump(
+                    mode="json",
+                    include={"photons", "spot_fwhm", "excess_noise", "read_noise", "pixels", "pixel_scale"},
+                )
+                for sensor in system.sensors
+            },
+        },
+        **details,
+        "versions": {
+            "srtomo": own_version,
+            "numpy": np.__version__,
+            "scipy": scipy.__version__,
+            "numba": numba.__version__,
+        },
+        "seconds": seconds,
+    }
