@@ -3,7 +3,8 @@
 Every frame number of a session gets exactly one answer. Messages are put in place by frame and sensor; a frame whose
 sensors are all in is answered at once. A frame that cannot be completed any more (a later one is complete, or two later
 ones have begun) is held, and so are whole frames when more than ``max_behind`` wait. Duplicates, late ones, other
-sessions, other instruments and damaged messages are counted and dropped.
+sessions, other instruments and damaged messages are counted and dropped. One stray frame number does not move the
+loop: a jump of the count is believed when a second exposure agrees, and the count of a session never goes back.
 """
 
 from __future__ import annotations
@@ -19,17 +20,20 @@ from numpy.typing import NDArray
 
 from srtomo_core.layout import Layout
 from srtomo_core.wire import DmCommandWriter, SlopeFrame, WireError, read_slope_frame
+from srtomo_rtc.exposure import Exposure, fits, subaperture_starts
 from srtomo_rtc.latency import LatencyHistogram
-from srtomo_rtc.loop import Loop, Program, Verdict
+from srtomo_rtc.loop import HISTORY, Loop, Program, Verdict
 
 Floats = NDArray[np.float32]
 
 _AHEAD = 8  # frames that may be in assembly at once
 _RECENT = 64  # answered frames whose sensors are remembered, to tell a duplicate from a late message
-_MAX_GAP = 64  # frame numbers farther off than this are another count, like another session
-_SESSION_SILENCE = 1_000_000_000  # ns without a usable message after which another count may take over
-
-_SNAPSHOT_ROWS = 16  # commands in a snapshot: a command later than that is held after a resume
+_MAX_JUMP = (
+    4096  # frames that a session may skip within the silence below; more is another count, as of another session
+)
+_SILENCE = 1_000_000_000  # ns without a usable message after which another count may take over
+_SHORT_JUMP = 64  # frames that a session may skip and still be the same count after a silence
+_STALLED = 100_000_000  # ns without a usable message after which a frame that has begun does not delay what was posted
 
 _HELD = {
     Verdict.HOLD_NONFINITE: "held_nonfinite",
@@ -122,18 +126,14 @@ class Hrtc:
         self._max_behind = max_behind
         self._fingerprint = layout.fingerprint
         self._n_sensors = len(layout.sensors)
-        self._counts = tuple(s.n_valid for s in layout.sensors)
-        self._starts = tuple(int(start) // 2 for start in layout.slope_start)
+        self._starts = subaperture_starts(layout)
         self._writer = DmCommandWriter("dm", layout.n_commands)
-        self._slopes = [[np.zeros(2 * n, np.float32) for n in self._counts] for _ in range(_AHEAD)]
-        self._filled = np.zeros((_AHEAD, self._starts[-1]), bool)
-        self._missing = [list(self._counts) for _ in range(_AHEAD)]
-        self._arrived = [0] * _AHEAD
-        self._mirror: list[tuple[int, int, float]] = [(-1, -1, 1.0)] * _AHEAD
-        self._stamp = [(0, 0)] * _AHEAD
+        self._exposures = [Exposure(self._starts) for _ in range(_AHEAD)]
+        self._complete_ns = [0] * _AHEAD
         self._used = [0] * _RECENT
         self._newest = -1
-        self._ready_ns = 0
+        self._jump = -1
+        self._decided_ns = 0
 
     def offer(self, buffer: bytes, now_ns: int) -> None:
         """Put one serialised SlopeFrame in its place; ``now_ns`` (monotonic) is when it was taken.
@@ -150,41 +150,36 @@ class Hrtc:
         if message.fingerprint != self._fingerprint:
             counters.dropped_fingerprint += 1
             return
-        if not self._fits(message):
+        if not fits(message, self._starts):
             counters.dropped_malformed += 1
             return
-        if message.session != self.session or abs(message.frame - self.loop.frame) > _MAX_GAP:
-            # one stray frame number must not move the loop: only silence makes room for another count
-            if self.session and now_ns - self.last_slopes_ns < _SESSION_SILENCE:
-                counters.dropped_session += 1
-                return
-            self._begin(message.session, message.frame)
-        elif message.frame < self.loop.frame:
+        same = message.session == self.session
+        ahead = message.frame - self.loop.frame
+        if same and ahead < 0:
             self._too_late(message)
             return
-        self.last_slopes_ns = now_ns
+        silent = not self.session or now_ns - self.last_slopes_ns >= _SILENCE
+        if silent and not (same and ahead <= _SHORT_JUMP):
+            self._begin(message.session, message.frame)
+        elif not same or ahead > _MAX_JUMP or (ahead >= _AHEAD and not self._agreed(message.frame)):
+            counters.dropped_session += 1
+            return
+        self.last_slopes_ns = self._decided_ns = now_ns
         while message.frame >= self.loop.frame + _AHEAD:
-            self._answer_next(Verdict.HOLD_MISSING)
-        self._place(message)
-        self._ready_ns = now_ns
+            self._skip_next()
+        self._place(message, now_ns)
 
-    def _fits(self, message: SlopeFrame) -> bool:
-        first, n = message.sensor, message.n_sensors
-        if n < 1 or first + n > self._n_sensors:
-            return False
-        if n == 1:
-            return (
-                message.n_subapertures > 0 and message.first_subaperture + message.n_subapertures <= self._counts[first]
-            )
-        return (
-            message.first_subaperture == 0 and message.n_subapertures == self._starts[first + n] - self._starts[first]
-        )
+    def _agreed(self, frame: int) -> bool:
+        """Whether a jump to ``frame`` follows on one of an earlier exposure, to just before it."""
+        step, self._jump = frame - self._jump, frame
+        return 0 < step < _AHEAD
 
     def _begin(self, session: int, frame: int) -> None:
-        for place in range(_AHEAD):
-            self._clear(place)
+        for exposure in self._exposures:
+            exposure.clear()
         for place in range(_RECENT):
             self._used[place] = 0
+        self._jump = -1
         same = session == self.session
         reason = f"frames go on at {frame} instead of {self.loop.frame}" if same else "slopes of a new session"
         # a loop that was closed while nothing came stays closed; later sessions start with an open one
@@ -195,11 +190,6 @@ class Hrtc:
         self.changes.put(Change("SESSION", session, frame, closed, self.loop.program, reason))
         self._prepare()
 
-    def _clear(self, place: int) -> None:
-        self._filled[place] = False
-        self._missing[place][:] = self._counts
-        self._arrived[place] = 0
-
     def _too_late(self, message: SlopeFrame) -> None:
         recent = self.loop.frame - message.frame <= _RECENT and message.frame >= self.loop.first_frame
         if recent and self._used[message.frame % _RECENT] >> message.sensor & 1:
@@ -207,32 +197,25 @@ class Hrtc:
         else:
             self.counters.dropped_late += 1
 
-    def _place(self, message: SlopeFrame) -> None:
+    def _place(self, message: SlopeFrame, now_ns: int) -> None:
         place = message.frame % _AHEAD
-        start = self._starts[message.sensor] + message.first_subaperture
-        span = self._filled[place, start : start + message.n_subapertures]
-        if span.any():
+        exposure = self._exposures[place]
+        before = exposure.arrived
+        if not exposure.put(message):
             self.counters.dropped_duplicate += 1
             return
-        span[:] = True
-        if not self._arrived[place]:
-            self._mirror[place] = (message.mirror_frame, message.mirror_frame_before, message.mirror_fraction)
-            self._stamp[place] = (message.stamp_sec, message.stamp_nanosec)
         if message.frame > self._newest:
             self._newest = message.frame
-        taken = 0
-        for sensor in range(message.sensor, message.sensor + message.n_sensors):
-            count = message.n_subapertures if message.n_sensors == 1 else self._counts[sensor]
-            first, n = message.first_subaperture, self._counts[sensor]
-            own = self._slopes[place][sensor]
-            own[first : first + count] = message.slopes[taken : taken + count]
-            own[n + first : n + first + count] = message.slopes[taken + count : taken + 2 * count]
-            taken += 2 * count
-            self._missing[place][sensor] -= count
-            if self._missing[place][sensor] == 0:
-                self._arrived[place] |= 1 << sensor
-                if message.frame == self.loop.frame:
-                    self.loop.add(sensor, own)
+        new = exposure.arrived & ~before
+        if new:
+            self._complete_ns[place] = now_ns
+            if message.frame == self.loop.frame:
+                self._add(exposure, new)
+
+    def _add(self, exposure: Exposure, sensors: int) -> None:
+        for sensor in range(self._n_sensors):
+            if sensors >> sensor & 1:
+                self.loop.add(sensor, exposure.slopes[sensor])
 
     def advance(self) -> None:
         """Answer every frame that is complete, and hold every frame that cannot be completed any more."""
@@ -241,15 +224,18 @@ class Hrtc:
             frame = loop.frame
             if self._newest < frame:
                 return
-            complete = loop.sensors == loop.all_sensors
             if self._newest - frame > self._max_behind:
-                self._answer_next(Verdict.HOLD_BEHIND if complete else Verdict.HOLD_MISSING)
-            elif complete:
+                self._skip_next()
+            elif loop.sensors == loop.all_sensors:
                 self._answer_next(Verdict.OK)
-            elif self._newest >= frame + 2 or self._arrived[(frame + 1) % _AHEAD] == loop.all_sensors:
+            elif self._newest >= frame + 2 or self._exposures[(frame + 1) % _AHEAD].arrived == loop.all_sensors:
                 self._answer_next(Verdict.HOLD_MISSING)
             else:
                 return
+
+    def _skip_next(self) -> None:
+        complete = self.loop.sensors == self.loop.all_sensors
+        self._answer_next(Verdict.HOLD_BEHIND if complete else Verdict.HOLD_MISSING)
 
     def want_snapshot(self) -> None:
         """Ask for a Snapshot after the next answer, in ``snapshots``. Any thread."""
@@ -259,15 +245,25 @@ class Hrtc:
         # once a second, after the command is out: the one place of the loop's thread that allocates
         loop = self.loop
         return Snapshot(sec, nanosec, self.session, loop.answered, loop.closed, loop.program, loop.consecutive_holds,
-                        loop.first_frame, loop.state.copy(), loop.history(_SNAPSHOT_ROWS))  # fmt: skip
+                        loop.first_frame, loop.state.copy(), loop.history(HISTORY))  # fmt: skip
 
-    def idle(self) -> None:
-        """No slopes are waiting: take up what was posted or requested, unless a frame has begun."""
-        if self.loop.pending and self.loop.sensors == 0:
-            self._prepare()
+    def idle(self, now_ns: int) -> None:
+        """No slopes are waiting: take up what was posted or requested, unless a frame is just coming in."""
+        loop = self.loop
+        if loop.pending and (loop.sensors == 0 or now_ns - self.last_slopes_ns > _STALLED):
+            self.take_up()
+
+    def take_up(self) -> None:
+        """Take up what was posted or requested, and form the products of what is here of the next frame anew."""
+        self.loop.sensors = 0
+        self._prepare()
+        exposure = self._exposures[self.loop.frame % _AHEAD]
+        if exposure.arrived:
+            self._add(exposure, exposure.arrived)
 
     def flatten(self) -> None:
         """Open the loop and answer the next frame with the offset alone, whether or not its slopes came."""
+        self._decided_ns = time.monotonic_ns()
         self.loop.request(closed=False)
         self.loop.state[:] = 0
         self.loop.sensors = 0
@@ -277,47 +273,43 @@ class Hrtc:
     def _answer_next(self, verdict: Verdict) -> None:
         loop, counters = self.loop, self.counters
         frame, place = loop.frame, loop.frame % _AHEAD
+        exposure = self._exposures[place]
+        since_ns = self._complete_ns[place] if exposure.arrived == loop.all_sensors else self._decided_ns
         program = loop.program
         if verdict is Verdict.OK:
-            verdict = loop.answer(*self._mirror[place])
+            verdict = loop.answer(*exposure.mirror)
         elif verdict is Verdict.OPEN:
             loop.hold(verdict)
         else:
-            if verdict is Verdict.HOLD_MISSING and self._filled[place].any():
+            if verdict is Verdict.HOLD_MISSING and exposure.begun:
                 verdict = Verdict.HOLD_INCOMPLETE
             loop.hold(verdict)
         ready = time.monotonic_ns()
         settings = program.settings.id if program else 0
         reconstructor = program.slot.id if program else 0
         gain = program.slot.gain if program else 0.0
-        sec, nanosec = self._stamp[place] if self._filled[place].any() else (0, 0)
+        sec, nanosec = exposure.stamp
         self._writer.values[:] = loop.command
         # the names are msgs_schema/msg/DmCommand's, in its order
         self._publish(
             self._writer.write(
                 sec, nanosec, self.session, frame, reconstructor, settings, loop.used, verdict, loop.closed,
                 min(loop.n_clipped, 65535), gain, loop.mirror_frame, loop.mirror_frame_before, loop.mirror_fraction,
-                (ready - self._ready_ns) * 1e-9,
+                (ready - since_ns) * 1e-9,
             )
         )  # fmt: skip
-        self.latency.add(time.monotonic_ns() - self._ready_ns)
+        self.latency.add(time.monotonic_ns() - since_ns)
         counters.commands += 1
         counters.clipped += loop.n_clipped
         held = _HELD.get(verdict)
         if held is not None:
             setattr(counters, held, getattr(counters, held) + 1)
         self._used[frame % _RECENT] = loop.used
-        self._clear(place)
+        exposure.clear()
         if self._snapshot_wanted:
             self._snapshot_wanted = False
             self.snapshots.put(self._snapshot(sec, nanosec))
-        self._prepare()
-        arrived = self._arrived[loop.frame % _AHEAD]
-        if arrived:
-            slopes = self._slopes[loop.frame % _AHEAD]
-            for sensor in range(self._n_sensors):
-                if arrived >> sensor & 1:
-                    loop.add(sensor, slopes[sensor])
+        self.take_up()
 
     def _prepare(self) -> None:
         loop = self.loop
@@ -326,6 +318,6 @@ class Hrtc:
         if loop.program is not program:
             self.changes.put(Change("PROGRAM", self.session, loop.frame, loop.closed, loop.program, ""))
         if loop.closed is not closed:
-            by_faults = closed and loop.consecutive_holds > 0
+            by_faults = closed and program is not None and loop.consecutive_holds > program.settings.fault_budget
             reason = f"{loop.consecutive_holds} frames held in a row" if by_faults else "asked for"
             self.changes.put(Change("LOOP", self.session, loop.frame, loop.closed, loop.program, reason))

@@ -1,1 +1,1 @@
-"""One module a sub-command: ``configure(parser)`` adds its arguments, ``main(options)`` runs it and returns the exit code."""
+"""One module a sub-command: ``configure(parser)`` adds its arguments, ``main(options)`` runs it: the exit code."""

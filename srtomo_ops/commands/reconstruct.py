@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import argparse
+import inspect
+import json
 import time
 from pathlib import Path
+from typing import Any
 
 from srtomo_ops.options import add_json, add_system, system_of, writable_file, write_json
 from srtomo_ops.progress import Progress
 from srtomo_srtc.model import ground_prior
-from srtomo_srtc.reconstructors import implicit
+from srtomo_srtc.reconstructors import METHODS
 
-EXAMPLE = "example:\n  srtomo reconstruct gnao_ltao_sr -o sr.npz"
+EXAMPLE = "examples:\n  srtomo reconstruct gnao_ltao_sr -o sr.npz\n  srtomo reconstruct mini --prior ground --with kappa=1e-3 -o m.npz"
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -24,18 +27,52 @@ def configure(parser: argparse.ArgumentParser) -> None:
         default="file",
         help="turbulence profile supposed: the instrument file's, or all of it at the ground (default: file)",
     )
+    parser.add_argument(
+        "--method", choices=sorted(METHODS), default="implicit", help="how (default: implicit); see the docstrings"
+    )
+    parser.add_argument(
+        "--with",
+        dest="keywords",
+        metavar="KEY=VALUE",
+        action="append",
+        default=[],
+        help="a parameter of the method, e.g. --with kappa=1e-3",
+    )
     parser.add_argument("--label", default="", help="a name for people (default: the prior)")
     add_json(parser)
+
+
+def keywords_of(options: argparse.Namespace) -> dict[str, Any]:
+    """The method's own parameters from ``--with``.
+
+    Raises:
+        ValueError: the method has no such parameter, or the value is not JSON.
+    """
+    names = inspect.signature(METHODS[options.method]).parameters
+    own = [name for name in names if name not in ("system", "layout", "label", "progress")]
+    keywords: dict[str, Any] = {}
+    for item in options.keywords:
+        key, _, value = item.partition("=")
+        if key not in own:
+            raise ValueError(f"--with {item}: method {options.method} takes {', '.join(own)}")
+        try:
+            keywords[key] = json.loads(value)
+        except json.JSONDecodeError:
+            keywords[key] = value
+    return keywords
 
 
 def main(options: argparse.Namespace) -> int:
     """Run the command."""
     system = system_of(options)
     writable_file(options.output)
+    keywords = keywords_of(options)
     believed = ground_prior(system) if options.prior == "ground" else system
     start = time.perf_counter()
     with Progress("reconstructor") as progress:
-        reconstructor, G = implicit(believed, label=options.label or options.prior, progress=progress.stage)
+        reconstructor, G = METHODS[options.method](
+            believed, label=options.label or options.prior, progress=progress.stage, **keywords
+        )
     seconds = time.perf_counter() - start
     reconstructor.save(options.output, G)
     print(

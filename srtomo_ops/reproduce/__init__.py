@@ -1,0 +1,1 @@
+"""Published figures, measured again with srtomo's own plant, loop and reconstructors."""
