@@ -14,7 +14,9 @@ from srtomo_ops.progress import Progress
 from srtomo_srtc.model import ground_prior
 from srtomo_srtc.reconstructors import METHODS
 
-EXAMPLE = "examples:\n  srtomo reconstruct gnao_ltao_sr -o sr.npz\n  srtomo reconstruct mini --prior ground --with kappa=1e-3 -o m.npz"
+EXAMPLE = """examples:
+  srtomo reconstruct gnao_ltao_sr -o sr.npz
+  srtomo reconstruct mini --prior ground --with kappa=1e-3 -o mini.npz"""
 
 
 def configure(parser: argparse.ArgumentParser) -> None:

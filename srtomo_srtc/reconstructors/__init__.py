@@ -8,7 +8,7 @@ from srtomo_srtc.reconstructors.implicit import implicit
 METHODS: dict[str, Callable[..., Any]] = {
     "implicit": implicit,
 }
-"""By the name that ``srtomo reconstruct --method`` knows: ``method(system, layout=None, *, label, noise_gain, progress, ...)``
-returns a Reconstructor and its G."""
+"""By the name that ``srtomo reconstruct --method`` knows: ``method(system, layout=None, *, label, noise_gain, progress,
+...)`` returns a Reconstructor and its G."""
 
 __all__ = ["METHODS", "implicit"]
