@@ -7,7 +7,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from srtomo_core.system import InstrumentError, System, load_system
+from srtomo_core.system import System, load_system
 
 
 def add_system(parser: argparse.ArgumentParser, default: str | None = None) -> None:
@@ -26,22 +26,31 @@ def add_system(parser: argparse.ArgumentParser, default: str | None = None) -> N
     )
 
 
+def assignments(items: list[str], option: str) -> dict[str, Any]:
+    """``KEY=VALUE`` items: values are JSON where they can be, otherwise strings.
+
+    Raises:
+        ValueError: one is not of that form.
+    """
+    values: dict[str, Any] = {}
+    for item in items:
+        key, separator, value = item.partition("=")
+        if not separator or not key:
+            raise ValueError(f"{option} {item}: expected KEY=VALUE")
+        try:
+            values[key] = json.loads(value)
+        except json.JSONDecodeError:
+            values[key] = value
+    return values
+
+
 def changes_of(options: argparse.Namespace) -> dict[str, Any]:
     """``--set`` as dotted keys.
 
     Raises:
-        InstrumentError: not of the form KEY=VALUE.
+        ValueError: not of the form KEY=VALUE.
     """
-    changes: dict[str, Any] = {}
-    for item in options.set:
-        key, separator, value = item.partition("=")
-        if not separator or not key:
-            raise InstrumentError(f"--set {item}: expected KEY=VALUE")
-        try:
-            changes[key] = json.loads(value)
-        except json.JSONDecodeError:
-            changes[key] = value
-    return changes
+    return assignments(options.set, "--set")
 
 
 def system_of(options: argparse.Namespace) -> System:

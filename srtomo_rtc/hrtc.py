@@ -91,7 +91,8 @@ class Snapshot(NamedTuple):
 class Hrtc:
     """The frame gate, the loop and the command's buffer.
 
-    One thread, the loop's, calls :meth:`offer`, :meth:`advance` and :meth:`idle`. Counters, histogram and the loop's
+    One thread, the loop's, calls :meth:`take_up` first, then :meth:`offer`, :meth:`advance` and :meth:`idle`, and
+    :meth:`flatten` last. Counters, histogram and the loop's
     public attributes may be read from any thread, which may also call :meth:`want_snapshot` and take from ``changes``
     and ``snapshots``.
 
@@ -171,8 +172,9 @@ class Hrtc:
 
     def _agreed(self, frame: int) -> bool:
         """Whether a jump to ``frame`` follows on one of an earlier exposure, to just before it."""
-        step, self._jump = frame - self._jump, frame
-        return 0 < step < _AHEAD
+        agreed = 0 < frame - self._jump < _AHEAD
+        self._jump = -1 if agreed else frame
+        return agreed
 
     def _begin(self, session: int, frame: int) -> None:
         for exposure in self._exposures:
@@ -255,7 +257,6 @@ class Hrtc:
 
     def take_up(self) -> None:
         """Take up what was posted or requested, and form the products of what is here of the next frame anew."""
-        self.loop.sensors = 0
         self._prepare()
         exposure = self._exposures[self.loop.frame % _AHEAD]
         if exposure.arrived:
@@ -266,7 +267,6 @@ class Hrtc:
         self._decided_ns = time.monotonic_ns()
         self.loop.request(closed=False)
         self.loop.state[:] = 0
-        self.loop.sensors = 0
         self._prepare()
         self._answer_next(Verdict.OPEN)
 

@@ -288,14 +288,14 @@ class Loop:
         self.state[:] = state
         for row, command in enumerate(history[-HISTORY:], start=frame + 1 - len(history[-HISTORY:])):
             self._history[row % HISTORY] = command
-        self.sensors = 0
         self.prepare()
 
     def prepare(self) -> None:
         """Take up what was posted or requested, and form c for the next frame, supposing its command was in time.
 
-        May be called again as long as no sensor was added to the frame.
+        Sensors that were added to the frame already have to be added again.
         """
+        self.sensors = 0
         if self._posted is not None:
             self.program, self._posted = self._posted, None
         self.closed = self._requested_closed and self.program is not None

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import argparse
 import inspect
-import json
 import time
 from pathlib import Path
 from typing import Any
 
-from srtomo_ops.options import add_json, add_system, system_of, writable_file, write_json
+from srtomo_ops.options import add_json, add_system, assignments, system_of, writable_file, write_json
 from srtomo_ops.progress import Progress
 from srtomo_srtc.model import ground_prior
 from srtomo_srtc.reconstructors import METHODS
@@ -48,19 +47,14 @@ def keywords_of(options: argparse.Namespace) -> dict[str, Any]:
     """The method's own parameters from ``--with``.
 
     Raises:
-        ValueError: the method has no such parameter, or the value is not JSON.
+        ValueError: the method has no such parameter.
     """
     names = inspect.signature(METHODS[options.method]).parameters
     own = [name for name in names if name not in ("system", "layout", "label", "progress")]
-    keywords: dict[str, Any] = {}
-    for item in options.keywords:
-        key, _, value = item.partition("=")
+    keywords = assignments(options.keywords, "--with")
+    for key in keywords:
         if key not in own:
-            raise ValueError(f"--with {item}: method {options.method} takes {', '.join(own)}")
-        try:
-            keywords[key] = json.loads(value)
-        except json.JSONDecodeError:
-            keywords[key] = value
+            raise ValueError(f"--with {key}: method {options.method} takes {', '.join(own)}")
     return keywords
 
 
