@@ -30,6 +30,9 @@ def transmission(telescope: Telescope, x: Array, y: Array) -> Array:
     inside = np.hypot(x, y) <= radius
     if telescope.obscuration > 0:
         inside &= np.hypot(x - cx, y - cy) > radius * telescope.obscuration
+    for spider in telescope.spiders:
+        c, s = np.cos(spider.angle), np.sin(spider.angle)
+        inside &= (c * x + s * y < 0) | (np.abs(c * y - s * x) >= spider.width / 2)
     return inside.astype(np.float64)
 
 
@@ -214,11 +217,12 @@ class Layout:
         telescope = system.telescope
         content = {
             "conventions": CONVENTIONS,
-            "pupil": [telescope.diameter, telescope.obscuration, *telescope.obscuration_centre],
+            "pupil": [telescope.diameter, telescope.obscuration, *telescope.obscuration_centre]
+            + [[spider.width, spider.angle] for spider in telescope.spiders],
             "zenith_angle": system.zenith_angle,
             "sensors": [
                 {
-                    "star": [star.position.x, star.position.y, star.altitude, star.tip_tilt],
+                    "star": [star.position.x, star.position.y, star.altitude, star.tip_tilt, star.focus],
                     "place": [*layout.shift, layout.rotation, layout.size],
                     "valid": np.flatnonzero(layout.mask).tolist(),
                 }

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, model_validator
 
 from srtomo_core.units import ARCSEC, Angle, Charge, Delay, Flux, Frequency, Length, Shift, Speed
 
@@ -37,9 +37,9 @@ class Direction(_Frozen):
 
     @model_validator(mode="before")
     @classmethod
-    def _from_polar(cls, value: Any) -> Any:
+    def _from_polar(cls, value: Any, info: ValidationInfo) -> Any:
         if isinstance(value, Mapping) and set(value) == {"radius", "angle"}:
-            polar = _Polar.model_validate(value, context={"from_file": isinstance(value["radius"], str)})
+            polar = _Polar.model_validate(value, context=info.context)
             return {
                 "x": f"{polar.radius * math.cos(polar.angle)!r} rad",
                 "y": f"{polar.radius * math.sin(polar.angle)!r} rad",
@@ -52,12 +52,20 @@ class _Polar(_Frozen):
     angle: Angle
 
 
+class Spider(_Frozen):
+    """One arm that holds the secondary mirror: from the pupil's centre outwards, counter-clockwise from +x."""
+
+    width: Annotated[Length, Field(gt=0)]
+    angle: Angle
+
+
 class Telescope(_Frozen):
-    """Circular pupil with a circular central obscuration."""
+    """Circular pupil with a circular central obscuration, and spiders if any."""
 
     diameter: Annotated[Length, Field(gt=0)]
     obscuration: Annotated[float, Field(ge=0, lt=1, description="diameter of the obscuration over that of the pupil")]
     obscuration_centre: tuple[Length, Length] = (0.0, 0.0)
+    spiders: tuple[Spider, ...] = ()
     altitude: Length = 0.0
 
 
@@ -94,8 +102,9 @@ class Atmosphere(_Frozen):
 class GuideStar(_Frozen):
     """A laser star at a finite height, or a natural one at infinity.
 
-    ``tip_tilt`` says whether a sensor on this star is trusted with overall tip-tilt: ``blind`` slopes have it projected
-    out. ``jitter`` is the simulated tip-tilt jitter of a laser's uplink, rms on each axis.
+    ``tip_tilt`` and ``focus`` say whether a sensor on this star is trusted with overall tip-tilt, and with focus, which
+    the sodium layer's height mimics: ``blind`` slopes have it projected out. ``jitter`` is the simulated tip-tilt
+    jitter of a laser's uplink, rms on each axis.
     """
 
     name: Name
@@ -103,7 +112,10 @@ class GuideStar(_Frozen):
     position: Direction
     altitude: Annotated[Length, Field(gt=0)] | None = None
     tip_tilt: Literal["seen", "blind"]
+    focus: Literal["seen", "blind"] = "seen"
     jitter: Annotated[Angle, Field(ge=0)]
+    launch: tuple[Length, Length] | None = None
+    sodium_thickness: Annotated[Length, Field(gt=0)] | None = None
 
     @model_validator(mode="before")
     @classmethod
@@ -118,6 +130,10 @@ class GuideStar(_Frozen):
     def _altitude_by_kind(self) -> GuideStar:
         if (self.kind == "laser") != (self.altitude is not None):
             raise ValueError("altitude: expected for a laser star, and only there")
+        if (self.launch is None) != (self.sodium_thickness is None):
+            raise ValueError("launch: expected together with sodium_thickness")
+        if self.launch is not None and self.kind != "laser":
+            raise ValueError("launch: expected for a laser star only")
         return self
 
 
@@ -325,6 +341,8 @@ def _first_problem(error: ValidationError) -> str:
     problems = error.errors(include_url=False, include_context=False)
     # an optional quantity that is wrong is also reported as "not None"
     problems = [p for p in problems if p["type"] != "none_required"]
+    # so is a list as too short when its only item is wrong
+    problems = [p for p in problems if p["type"] != "too_short" or len(problems) == 1]
     # a misspelt key is reported as missing as well: the misspelling is the news
     problems.sort(key=lambda problem: problem["type"] != "extra_forbidden")
     first = problems[0]
@@ -372,6 +390,8 @@ def load_system(name: str | Path, changes: Mapping[str, Any] | None = None) -> S
             text, source = Path(name).read_text(encoding="utf-8"), Path(name).name
         except OSError as error:
             raise InstrumentError(f"{text_name}: {error.strerror or error}") from None
+        except UnicodeDecodeError:
+            raise InstrumentError(f"{text_name}: not a text file") from None
     elif text_name in system_names():
         text = (resources.files("srtomo_core") / "systems" / f"{text_name}.yaml").read_text(encoding="utf-8")
         source = f"{text_name}.yaml"

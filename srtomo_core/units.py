@@ -56,10 +56,11 @@ def parse(kind: str, value: object) -> float:
 
 def _reader(kind: str) -> BeforeValidator:
     def read(value: object, info: ValidationInfo) -> float:
-        # Models are also built, and copied with changes, in Python, where a float is SI already;
+        # Models are also built, and copied with changes, in Python, where a number is SI already;
         # in a file a bare number is a missing unit.
-        if isinstance(value, float) and not (info.context or {}).get("from_file"):
-            return value
+        number = isinstance(value, float | int) and not isinstance(value, bool)
+        if number and not (info.context or {}).get("from_file"):
+            return float(value)  # type: ignore[arg-type]
         return parse(kind, value)
 
     return BeforeValidator(read)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,7 +47,7 @@ class Exposure:
 
     def __init__(self, starts: Sequence[int]) -> None:
         self._starts = tuple(starts)
-        self._counts = tuple(b - a for a, b in zip(starts, starts[1:]))
+        self._counts = tuple(b - a for a, b in pairwise(starts))
         self.slopes = tuple(np.zeros(2 * n, np.float32) for n in self._counts)
         self._filled = np.zeros(starts[-1], bool)
         self._missing = list(self._counts)

@@ -91,7 +91,7 @@ class Snapshot(NamedTuple):
 class Hrtc:
     """The frame gate, the loop and the command's buffer.
 
-    One thread, the loop's, calls :meth:`take_up` first, then :meth:`offer`, :meth:`advance` and :meth:`idle`, and
+    One thread, the loop's, calls :meth:`start` first, then :meth:`offer`, :meth:`advance` and :meth:`idle`, and
     :meth:`flatten` last. Counters, histogram and the loop's
     public attributes may be read from any thread, which may also call :meth:`want_snapshot` and take from ``changes``
     and ``snapshots``.
@@ -123,6 +123,7 @@ class Hrtc:
         self._snapshot_wanted = False
         self.session = 0
         self.last_slopes_ns = 0
+        self._fresh = True
         self._publish = publish
         self._max_behind = max_behind
         self._fingerprint = layout.fingerprint
@@ -135,6 +136,11 @@ class Hrtc:
         self._newest = -1
         self._jump = -1
         self._decided_ns = 0
+
+    def start(self) -> None:
+        """Begin to run, or to run again: the next slopes begin a session anew; its frames up to here are the past."""
+        self._fresh = True
+        self._take_up()
 
     def offer(self, buffer: bytes, now_ns: int) -> None:
         """Put one serialised SlopeFrame in its place; ``now_ns`` (monotonic) is when it was taken.
@@ -159,10 +165,10 @@ class Hrtc:
         if same and ahead < 0:
             self._too_late(message)
             return
-        silent = not self.session or now_ns - self.last_slopes_ns >= _SILENCE
-        if silent and not (same and ahead <= _SHORT_JUMP):
+        silent = now_ns - self.last_slopes_ns >= _SILENCE
+        if self._fresh or (silent and not (same and ahead <= _SHORT_JUMP)):
             self._begin(message.session, message.frame)
-        elif not same or ahead > _MAX_JUMP or (ahead >= _AHEAD and not self._agreed(message.frame)):
+        elif not same or ahead > _MAX_JUMP or not self._follows(message.frame):
             counters.dropped_session += 1
             return
         self.last_slopes_ns = self._decided_ns = now_ns
@@ -170,9 +176,11 @@ class Hrtc:
             self._skip_next()
         self._place(message, now_ns)
 
-    def _agreed(self, frame: int) -> bool:
-        """Whether a jump to ``frame`` follows on one of an earlier exposure, to just before it."""
-        agreed = 0 < frame - self._jump < _AHEAD
+    def _follows(self, frame: int) -> bool:
+        """Whether ``frame`` follows on the newest, or on an earlier exposure that jumped to just before it."""
+        if frame <= max(self._newest, self.loop.frame) + _AHEAD:
+            return True
+        agreed = 0 < frame - self._jump <= _AHEAD
         self._jump = -1 if agreed else frame
         return agreed
 
@@ -184,8 +192,11 @@ class Hrtc:
         self._jump = -1
         same = session == self.session
         reason = f"frames go on at {frame} instead of {self.loop.frame}" if same else "slopes of a new session"
-        # a loop that was closed while nothing came stays closed; later sessions start with an open one
-        closed = self.loop.closed and not self.session
+        # a loop that was closed before any slopes came stays closed; a session after another starts with an open one
+        if self._fresh:
+            self._prepare()
+        closed = self.loop.closed and self._fresh
+        self._fresh = False
         self.session = session
         self._newest = frame
         self.loop.start(frame, closed)
@@ -253,9 +264,9 @@ class Hrtc:
         """No slopes are waiting: take up what was posted or requested, unless a frame is just coming in."""
         loop = self.loop
         if loop.pending and (loop.sensors == 0 or now_ns - self.last_slopes_ns > _STALLED):
-            self.take_up()
+            self._take_up()
 
-    def take_up(self) -> None:
+    def _take_up(self) -> None:
         """Take up what was posted or requested, and form the products of what is here of the next frame anew."""
         self._prepare()
         exposure = self._exposures[self.loop.frame % _AHEAD]
@@ -309,7 +320,7 @@ class Hrtc:
         if self._snapshot_wanted:
             self._snapshot_wanted = False
             self.snapshots.put(self._snapshot(sec, nanosec))
-        self.take_up()
+        self._take_up()
 
     def _prepare(self) -> None:
         loop = self.loop

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 from srtomo_core.wire import WireError, read_dm_command, read_slope_frame
 
 _GAPS_REPORTED = 20
+_OPEN = 1  # DmCommand.OPEN
 _QUIET = 0.5  # s without slopes or commands after which nothing can be under way any more
 
 
@@ -100,6 +101,7 @@ class _Stream(NamedTuple):
 class _Session:
     slopes: dict[_Stream, FrameSet] = field(default_factory=dict)
     commands: FrameSet = field(default_factory=FrameSet)
+    last_answer: int = -1  # highest number of a command that answers slopes, or their absence
     adopted: list[int] = field(default_factory=list)  # first frames that the HRTC said it would answer
     last_arrival: float = 0.0
 
@@ -120,9 +122,10 @@ class _Session:
         """
         if not self.slopes:
             return {}, []
-        everything = [*self.slopes.values(), *([self.commands] if len(self.commands) else [])]
         firsts = [have.first for have in self.slopes.values()]
-        lasts = [have.last for have in everything]
+        lasts = [have.last for have in self.slopes.values()]
+        if self.last_answer >= 0:
+            lasts.append(self.last_answer)
         partial_start = 0 < min(firsts) and max(firsts) - min(firsts) <= in_flight
         first = max(firsts) if partial_start else min(firsts)
         partial_end = not quiet and max(lasts) - min(lasts) <= in_flight
@@ -207,6 +210,9 @@ class Ledger:
         session = self._session(message.session)
         session.last_arrival = self._clock()
         self.duplicate_commands += not session.commands.add(message.frame)
+        # the flat that a stopping HRTC leaves behind does not need slopes
+        if message.sensors or message.verdict != _OPEN:
+            session.last_answer = max(session.last_answer, message.frame)
 
     def add_adoption(self, session: int, first_frame: int) -> None:
         """Book that the HRTC adopted a session, and the first frame that it answers."""

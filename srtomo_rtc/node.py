@@ -18,6 +18,7 @@ import signal
 import threading
 import time
 import traceback
+from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
@@ -44,14 +45,15 @@ from srtomo_core import wire
 from srtomo_core.layout import Layout
 from srtomo_core.reconstructor import Reconstructor, ReconstructorError, load_interaction_matrix
 from srtomo_core.system import InstrumentError, load_system
+from srtomo_rtc.events import EventKind, change_fields, event_fields, state_fields
 from srtomo_rtc.hot import HotEndpoints
-from srtomo_rtc.hrtc import Change, Hrtc, Snapshot
+from srtomo_rtc.hrtc import Hrtc, Snapshot
 from srtomo_rtc.loop import Program, Settings
 from srtomo_rtc.swap import Manifest, Refused, Swap
-from srtomo_rtc.vmm import KERNEL
 
 _ADOPTION_TIMEOUT = 2.0  # s for the loop to take up what was posted: it does between two frames, or at once if idle
 _RESEND_AFTER = 1.0  # s without a new block before missing ones are asked for
+_SILENT = 0.1  # s without slopes that are worth a warning
 _GIVE_UP_AFTER = 10.0  # s without a new block before a transfer is refused
 
 
@@ -128,10 +130,10 @@ class HrtcNode(LifecycleNode):
         self.create_timer(1.0, self._every_second)
         self._worker = ThreadPoolExecutor(max_workers=1, thread_name_prefix="staging")
         self._manifest: Manifest | None = None
-        self._early_blocks: list[wire.ReconstructorBlock] = []
+        self._early_blocks: deque[wire.ReconstructorBlock] = deque(maxlen=wire.RECONSTRUCTOR_BLOCK.depth)
         self._last_block = 0.0
         self._resend_asked = 0.0
-        self._kinds: dict[int, tuple[int, str]] = {}
+        self._kinds: dict[int, tuple[EventKind, str]] = {}
         self._taken_up: tuple[Program | None, int] = (None, 0)  # the newest program that the loop runs, its first frame
         self._refused = 0
         self._realtime: list[realtime.Outcome] = [_BLAS]
@@ -178,7 +180,8 @@ class HrtcNode(LifecycleNode):
             self.failure = traceback.format_exc().splitlines()[-1]
             return TransitionCallbackReturn.ERROR
         self._lifecycle = name
-        self._event(HrtcEvent.LIFECYCLE, text=name)
+        self.failure = None
+        self._event(EventKind.LIFECYCLE, name)
         return TransitionCallbackReturn.SUCCESS
 
     def _value(self, name: str) -> Any:
@@ -187,11 +190,25 @@ class HrtcNode(LifecycleNode):
     def _configure(self) -> None:
         if not self._value("system"):
             raise InstrumentError("parameter system: expected a name or the path of a .yaml file")
-        system = load_system(self._value("system"), json.loads(self._value("changes")))
+        changes = json.loads(self._value("changes"))
+        if not isinstance(changes, dict):
+            raise InstrumentError(f"parameter changes: expected a JSON object, got {self._value('changes')}")
+        system = load_system(self._value("system"), changes)
         layout = Layout(system)
         if not self._value("interaction_matrix"):
             raise ReconstructorError("parameter interaction_matrix: expected a file made by 'srtomo calibrate'")
         G_cal = load_interaction_matrix(self._value("interaction_matrix"), layout.fingerprint)
+        settings = Settings(
+            id=1,
+            offset=np.zeros(layout.n_commands, np.float32),
+            slope_reference=np.zeros(layout.n_slopes, np.float32),
+            polc=self._value("polc"),
+            leak=self._value("leak") or system.loop.leak,
+            relaxation=self._value("relaxation"),
+            command_limit=self._value("command_limit"),
+            fault_budget=self._value("fault_budget"),
+        )
+        swap = Swap(system, layout, G_cal, settings, self._post)
         loop = system.loop
         deadline = self._value("deadline") or max(loop.delay - 1, 0.1) / loop.rate
         hot = HotEndpoints(self._hot_node, wire.COMMAND.depth_at(loop.rate))
@@ -202,20 +219,12 @@ class HrtcNode(LifecycleNode):
             deadline_ns=int(deadline * 1e9),
             max_behind=self._value("max_behind"),
         )
-        self._hot = hot
-        settings = Settings(
-            id=1,
-            offset=np.zeros(layout.n_commands, np.float32),
-            slope_reference=np.zeros(layout.n_slopes, np.float32),
-            polc=self._value("polc"),
-            leak=self._value("leak") or loop.leak,
-            relaxation=self._value("relaxation"),
-            command_limit=self._value("command_limit"),
-            fault_budget=self._value("fault_budget"),
-        )
-        self._swap = Swap(system, layout, G_cal, settings, self._post)
-        self._layout = layout
-        self._load_first()
+        self._hot, self._swap, self._layout = hot, swap, layout
+        try:
+            self._load_first()
+        except ValueError:
+            self._clean_up()
+            raise
         self._realtime = [
             _BLAS,
             realtime.lock_memory(),
@@ -228,15 +237,21 @@ class HrtcNode(LifecycleNode):
 
     def _load_first(self) -> None:
         """Start from the file of parameter ``reconstructor``, or else from the last one committed."""
-        assert self._swap is not None
-        path = self._value("reconstructor")
         keep = self._value("keep")
-        if not path and keep and Path(keep).exists():
-            path = keep
-        if path:
-            held = self._swap.stage_whole(Reconstructor.load(path))
-            program = self._swap.commit(held.slot.id, held.slot.sha256)
-            self._kinds[id(program)] = (HrtcEvent.COMMIT, f"{held.label} from {Path(path).name}")
+        if path := self._value("reconstructor"):
+            self._load(path)
+        elif keep and Path(keep).exists():
+            try:
+                self._load(keep)
+            except (ReconstructorError, Refused) as error:
+                # nobody asked for this very one: without it the HRTC waits for the SRTC's
+                self.get_logger().warning(f"{keep} is not used: {error}")
+
+    def _load(self, path: str) -> None:
+        assert self._swap is not None
+        held = self._swap.stage_whole(Reconstructor.load(path))
+        program = self._swap.commit(held.slot.id, held.slot.sha256)
+        self._kinds[id(program)] = (EventKind.COMMIT, f"{held.label} from {Path(path).name}")
 
     def _activate(self) -> None:
         self._stop.clear()
@@ -259,6 +274,8 @@ class HrtcNode(LifecycleNode):
         if self._hot is not None:
             self._hot.destroy()
         self._hot = self._hrtc = self._swap = None
+        self._kinds.clear()
+        self._taken_up = (None, 0)
 
     def close(self) -> None:
         """Stop everything, in an order that never publishes into what is gone."""
@@ -278,6 +295,7 @@ class HrtcNode(LifecycleNode):
         assert hrtc is not None and hot is not None
         try:
             with hot:
+                hrtc.start()
                 while not self._stop.is_set():
                     hot.wait(100_000_000)
                     while True:
@@ -286,7 +304,7 @@ class HrtcNode(LifecycleNode):
                             break
                         hrtc.offer(message, time.monotonic_ns())
                     hrtc.advance()
-                    hrtc.idle()
+                    hrtc.idle(time.monotonic_ns())
                 if hrtc.session and (hrtc.loop.closed or hrtc.loop.state.any()):
                     hrtc.flatten()
         except Exception:
@@ -324,14 +342,16 @@ class HrtcNode(LifecycleNode):
 
     def _begin(self, manifest: Manifest) -> None:
         assert self._swap is not None
-        known = (self._swap.active, self._swap.staged, self._swap.previous)
+        known = (self._swap.active, self._swap.staged)
         if any(held is not None and held.slot.sha256 == manifest.sha256 for held in known):
-            return  # a late repetition of what is here already
-        self._last_block = self._resend_asked = time.monotonic()
-        self._watch(self._worker.submit(self._swap.begin, manifest), manifest)
-        early, self._early_blocks = self._early_blocks, []
-        for block in early:
-            self._take(block)
+            # a late repetition of what is here already
+            self._worker.submit(self._swap.forget)
+        else:
+            self._last_block = self._resend_asked = time.monotonic()
+            self._watch(self._worker.submit(self._swap.begin, manifest), manifest)
+            for block in self._early_blocks:
+                self._take(block)
+        self._early_blocks.clear()
 
     def _on_block(self, data: bytes) -> None:
         try:
@@ -341,7 +361,7 @@ class HrtcNode(LifecycleNode):
             return
         if self._swap is None or self._manifest is None or block.sha256 != self._manifest.sha256:
             # blocks and manifest are two topics: a block may come before its manifest
-            self._early_blocks = [*self._early_blocks, block][-wire.RECONSTRUCTOR_BLOCK.depth :]
+            self._early_blocks.append(block)
             return
         self._take(block)
 
@@ -354,10 +374,10 @@ class HrtcNode(LifecycleNode):
             if swap.take(block):
                 held = swap.stage()
                 self._event(
-                    HrtcEvent.STAGED,
-                    text=f"{held.label}: stability {held.check.stability:.3f}, "
+                    EventKind.STAGED,
+                    f"{held.label}: stability {held.check.stability:.3f}, "
                     f"scale {held.check.scale[0]:.2f} to {held.check.scale[1]:.2f}",
-                    reconstructor=(held.slot.id, held.slot.sha256),
+                    held.slot.sha256,
                 )
 
         self._watch(self._worker.submit(take), manifest)
@@ -377,7 +397,7 @@ class HrtcNode(LifecycleNode):
     def _refuse(self, manifest: Manifest, reason: str) -> None:
         self._refused += 1
         self.get_logger().warning(f"reconstructor {manifest.id:016x} refused: {reason}")
-        self._event(HrtcEvent.REFUSED, text=reason, reconstructor=(manifest.id, manifest.sha256))
+        self._event(EventKind.REFUSED, reason, manifest.sha256)
 
     def _ask_again(self) -> None:
         missing = self._swap.missing if self._swap is not None else None
@@ -389,7 +409,7 @@ class HrtcNode(LifecycleNode):
             manifest = self._manifest
             self._manifest = None
             assert self._swap is not None and manifest is not None
-            self._swap.forget()
+            self._worker.submit(self._swap.forget).result()
             self._refuse(manifest, f"{len(blocks)} of {manifest.n_blocks} blocks never came")
         elif now - max(self._last_block, self._resend_asked) > _RESEND_AFTER and self._resend.service_is_ready():
             self._resend_asked = now
@@ -404,34 +424,39 @@ class HrtcNode(LifecycleNode):
         elif request.data and (self._swap is None or self._swap.active is None):
             response.message = "no reconstructor is active: commit one first"
         else:
+            opened_by_faults = hrtc.loop.opened_by_faults
             hrtc.loop.request(closed=request.data)
             assert self._hot is not None
             self._hot.wake()
             response.success = self._wait_for(lambda: hrtc.loop.closed is request.data)
             response.message = "closed" if hrtc.loop.closed else "open"
+            if not response.success:
+                by_itself = hrtc.loop.opened_by_faults > opened_by_faults
+                reason = "it opened again by itself" if by_itself else "the loop has not taken the request up"
+                response.message += f": {reason} in {_ADOPTION_TIMEOUT:g} s"
         self._publish_changes()
         return response
 
     def _commit(
         self, request: SwapReconstructor.Request, response: SwapReconstructor.Response
     ) -> SwapReconstructor.Response:
-        return self._swap_service(request, response, HrtcEvent.COMMIT)
+        return self._swap_service(request, response, EventKind.COMMIT)
 
     def _roll_back(
         self, request: SwapReconstructor.Request, response: SwapReconstructor.Response
     ) -> SwapReconstructor.Response:
-        return self._swap_service(request, response, HrtcEvent.ROLLBACK)
+        return self._swap_service(request, response, EventKind.ROLLBACK)
 
-    def _swap_service(self, request: Any, response: Any, kind: int) -> Any:
+    def _swap_service(self, request: Any, response: Any, kind: EventKind) -> Any:
         swap = self._swap
         if swap is None:
             response.message = "the HRTC is not configured"
             return response
-        action = swap.commit if kind == HrtcEvent.COMMIT else swap.roll_back
+        action = swap.commit if kind is EventKind.COMMIT else swap.roll_back
         try:
             program = self._worker.submit(action, request.id, bytes(request.sha256)).result()
         except Refused as error:
-            self._event(HrtcEvent.REFUSED, text=str(error), reconstructor=(request.id, bytes(request.sha256)))
+            self._event(EventKind.REFUSED, str(error), bytes(request.sha256))
             response.message = str(error)
             return response
         assert swap.active is not None
@@ -461,8 +486,9 @@ class HrtcNode(LifecycleNode):
         response.settings = swap.settings.id
         if program is None:
             response.success, response.message = True, "taken up with the first reconstructor"
+            self._event(EventKind.SETTINGS, "static shape")
         else:
-            self._kinds[id(program)] = (HrtcEvent.SETTINGS, "static shape")
+            self._kinds[id(program)] = (EventKind.SETTINGS, "static shape")
             response.success, response.first_frame, response.message = self._adopted(program, "static shape")
         return response
 
@@ -472,9 +498,13 @@ class HrtcNode(LifecycleNode):
         assert hrtc is not None
         if self._thread is None:
             return True, hrtc.loop.frame, f"{what}: in force when the HRTC is activated"
-        if not self._wait_for(lambda: hrtc.loop.program is program):
+
+        def taken_up() -> bool:
+            self._publish_changes()
+            return self._taken_up[0] is program
+
+        if not self._wait_for(taken_up):
             return False, 0, f"{what}: posted, but the loop has not taken it up in {_ADOPTION_TIMEOUT:g} s"
-        self._publish_changes()
         return True, self._taken_up[1], what
 
     @staticmethod
@@ -490,7 +520,12 @@ class HrtcNode(LifecycleNode):
         path = self._value("keep")
         if path:
             assert self._swap is not None
-            self._worker.submit(self._swap.save_active, path)
+
+            def report(done: Future[None]) -> None:
+                if (error := done.exception()) is not None:
+                    self.get_logger().error(f"{path}: the committed reconstructor was not kept ({error})")
+
+            self._worker.submit(self._swap.save_active, path).add_done_callback(report)
 
     # -- parameters -------------------------------------------------------------------------------------------------
 
@@ -499,46 +534,37 @@ class HrtcNode(LifecycleNode):
         changes = {p.name: p.value for p in parameters if p.name in _LIVE}
         if swap is not None and changes:
             program = self._worker.submit(lambda: swap.change_settings(**changes)).result()
-            if program is not None:
-                text = ", ".join(f"{name} = {value}" for name, value in changes.items())
-                self._kinds[id(program)] = (HrtcEvent.SETTINGS, text)
+            text = ", ".join(f"{name} = {value}" for name, value in changes.items())
+            if program is None:
+                self._event(EventKind.SETTINGS, text)
+            else:
+                self._kinds[id(program)] = (EventKind.SETTINGS, text)
         return SetParametersResult(successful=True)
 
     # -- what is published ------------------------------------------------------------------------------------------
 
-    def _event(
-        self,
-        kind: int,
-        *,
-        text: str = "",
-        reconstructor: tuple[int, bytes] | None = None,
-        change: Change | None = None,
-    ) -> None:
-        """Publish an event; from the executor's or the worker's thread."""
-        message = HrtcEvent(kind=kind, text=text, kernel=KERNEL)
-        message.header.stamp = self.get_clock().now().to_msg()
+    def _event(self, kind: EventKind, text: str, sha256: bytes | None = None) -> None:
+        """Tell of something that the loop did not have to take up; ``sha256`` of the reconstructor in question, if one
+        is. From the executor's or the worker's thread."""
         hrtc, swap = self._hrtc, self._swap
-        program = change.program if change is not None else hrtc.loop.program if hrtc is not None else None
-        settings = program.settings if program is not None else swap.settings if swap is not None else None
+        now: dict[str, Any] = {}
         if hrtc is not None:
-            message.session = change.session if change is not None else hrtc.session
-            message.first_frame = change.frame if change is not None else hrtc.loop.frame
-            message.loop_state = int(change.closed if change is not None else hrtc.loop.closed)
-            message.delay = hrtc.loop.delay
-        if reconstructor is not None:
-            message.reconstructor, message.sha256 = reconstructor[0], list(reconstructor[1])
-        elif program is not None:
-            message.reconstructor, message.sha256 = program.slot.id, list(program.slot.sha256)
-        if settings is not None:
-            message.settings = settings.id
-            message.polc = settings.polc
-            message.leak = settings.leak
-            message.relaxation = settings.relaxation
-            message.command_limit = settings.command_limit
-            message.fault_budget = settings.fault_budget
-            if change is not None and change.what == "PROGRAM":
-                message.offset = settings.offset.tolist()
-                message.slope_reference = settings.slope_reference.tolist()
+            loop = hrtc.loop
+            now = {
+                "session": hrtc.session,
+                "frame": loop.frame,
+                "closed": loop.closed,
+                "delay": loop.delay,
+                "program": loop.program,
+            }
+        fields = event_fields(kind, text, **now, settings=swap.settings if swap is not None else None)
+        if sha256 is not None:
+            fields |= {"reconstructor": int.from_bytes(sha256[:8], "big"), "sha256": list(sha256)}
+        self._publish_event(fields)
+
+    def _publish_event(self, fields: dict[str, Any]) -> None:
+        message = HrtcEvent(**fields)
+        message.header.stamp = self.get_clock().now().to_msg()
         self._events.publish(message)
 
     def _publish_changes(self) -> None:
@@ -546,29 +572,15 @@ class HrtcNode(LifecycleNode):
         while hrtc is not None and not hrtc.changes.empty():
             change = hrtc.changes.get()
             if change.what == "PROGRAM":
-                kind, text = self._kinds.pop(id(change.program), (HrtcEvent.SETTINGS, ""))
+                kind, text = self._kinds.pop(id(change.program), (EventKind.SETTINGS, ""))
                 self._taken_up = (change.program, change.frame)
             else:
-                kind = HrtcEvent.LOOP if change.what == "LOOP" else HrtcEvent.SESSION
-                text = change.reason
-            self._event(kind, text=text, change=change)
+                kind, text = EventKind[change.what], change.reason
+            self._publish_event(change_fields(change, kind, text, hrtc.loop.delay))
 
     def _publish_snapshot(self, snapshot: Snapshot) -> None:
-        message = HrtcState(
-            session=snapshot.session,
-            frame=snapshot.frame,
-            loop_state=int(snapshot.closed),
-            consecutive_holds=snapshot.consecutive_holds,
-            first_frame=snapshot.first_frame,
-            state=snapshot.state.tolist(),
-            n_frames=len(snapshot.history),
-            history=snapshot.history.ravel().tolist(),
-        )
+        message = HrtcState(**state_fields(snapshot))
         message.header.stamp.sec, message.header.stamp.nanosec = snapshot.stamp_sec, snapshot.stamp_nanosec
-        if snapshot.program is not None:
-            message.reconstructor = snapshot.program.slot.id
-            message.sha256 = list(snapshot.program.slot.sha256)
-            message.settings = snapshot.program.settings.id
         self._states.publish(message)
 
     def _every_100_ms(self) -> None:
@@ -624,13 +636,12 @@ class HrtcNode(LifecycleNode):
             return DiagnosticStatus.ERROR, self.failure
         if hrtc is None or self._thread is None:
             return DiagnosticStatus.OK, self._lifecycle
-        period = 1.0 / 10
         silence = (time.monotonic_ns() - hrtc.last_slopes_ns) * 1e-9
         if hrtc.loop.opened_by_faults:
             return DiagnosticStatus.ERROR, f"the loop opened by itself {hrtc.loop.opened_by_faults} times"
         if not hrtc.session:
             return DiagnosticStatus.OK, "waiting for slopes"
-        if silence > period:
+        if silence > _SILENT:
             return DiagnosticStatus.WARN, f"no slopes for {silence:.1f} s"
         if hrtc.latency.misses:
             return DiagnosticStatus.WARN, f"{hrtc.latency.misses} deadline misses"
@@ -653,7 +664,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     executor.add_node(node)
     try:
         while not stop.is_set():
-            executor.spin_once(timeout_sec=0.1)
+            try:
+                executor.spin_once(timeout_sec=0.1)
+            except Exception:
+                # no callback may end the loop; one of rclpy fails when the state does not have the transition asked for
+                node.get_logger().error(f"a call failed:\n{traceback.format_exc()}")
     finally:
         executor.remove_node(node)
         failed = node.failure is not None and "thread died" in node.failure

@@ -40,6 +40,7 @@ from srtomo_rtc.ledger import Ledger
 
 _HOT_PERIOD = 0.01  # s between visits to the topics of every frame
 _SLOW_VISITS = 10  # the other topics are visited at every tenth of those
+_LEAST_DEPTH = 16  # messages, of the slow topics' readers
 _STATUS_PERIOD = 0.5  # s
 _FLUSH_PERIOD = 1.0  # s: what a killed recorder loses at the most, when messages are rare
 _UNMATCHED_STATUSES = 4  # in a row: after 2 s a publisher in the graph is not merely being discovered
@@ -169,7 +170,10 @@ class Recorder:
         status_qos = QoSProfile(**RECORDER_STATUS.qos())
         self._status = self._node.create_publisher(RecorderStatus, RECORDER_STATUS.name, status_qos)
         per_second = {SLOPES: rate * len(layout.sensors), COMMAND: rate}
-        self._taps = [self._tap(topic, topic.depth_at(per_second.get(topic, 0.0))) for topic in topics]
+        # several may come between two visits, also where a writer keeps but the last for late readers
+        self._taps = [
+            self._tap(topic, max(_LEAST_DEPTH, topic.depth_at(per_second.get(topic, 0.0)))) for topic in topics
+        ]
         self._hot = [tap for tap in self._taps if tap.topic in (SLOPES, COMMAND)]
         self._unrecorded: list[str] = []
         self._scribe = _Scribe(bag)

@@ -13,24 +13,23 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from srtomo_core import wire
 from srtomo_core.bag import BagError, BagReader
 from srtomo_core.layout import Layout
 from srtomo_core.messages import decode
-from srtomo_core.reconstructor import Reconstructor, block_table
+from srtomo_core.reconstructor import Reconstructor, ReconstructorError, block_table
 from srtomo_core.system import System
+from srtomo_rtc.events import PROGRAM_KINDS, EventKind
+from srtomo_rtc.exposure import Exposure, fits, subaperture_starts
 from srtomo_rtc.loop import Loop, Program, Settings, Slot, Verdict
 from srtomo_rtc.vmm import KERNEL
 
-Floats = NDArray[np.float32]
-
 _TIMED = (Verdict.HOLD_INCOMPLETE, Verdict.HOLD_MISSING, Verdict.HOLD_BEHIND)
 _WINDOW = 400  # frames that the bag's order of messages may be off by
-_PROGRAM_KINDS = (0, 2, 3)  # HrtcEvent.SETTINGS, COMMIT, ROLLBACK
-_LOOP, _SESSION = 1, 6  # HrtcEvent.LOOP, SESSION
 _SHOWN = 5  # differing frames that are kept for the report
+
+_Key = tuple[int, int]  # session, frame
 
 
 @dataclass
@@ -41,10 +40,10 @@ class Outcome:
         compared: frames whose recorded answer was compared.
         differing: of these, answers that differ in a bit of a command, in the verdict or in the reconstructor.
         held: of those compared, answers that were holds.
-        unanswered: frames with slopes but without a recorded command.
-        skipped: frames that could not be replayed, for the reason in ``gaps``.
+        unanswered: frames with slopes but without a recorded answer, once the session had begun.
+        skipped: recorded answers that could not be compared, for the reasons in ``gaps``.
         first_differing: the first few frames that differ, with what differs.
-        gaps: why the replay lost the thread, and where it took it up again.
+        gaps: why and where the replay lost the thread; it takes it up at the next recorded state or session.
     """
 
     compared: int = 0
@@ -62,13 +61,6 @@ class Outcome:
         self.differing += 1
         if len(self.first_differing) < _SHOWN:
             self.first_differing.append(f"frame {frame}: {what}")
-
-
-class _Frame(NamedTuple):
-    """What the bag holds of one exposure."""
-
-    slopes: list[Floats | None]
-    mirror: list[tuple[int, int, float]]
 
 
 class Replay:
@@ -89,11 +81,9 @@ class Replay:
             raise BagError(f"{reader.path}: does not say which instrument it is of: not recorded by 'srtomo record'?")
         self.system = System.model_validate_json(text)
         self.layout = Layout(self.system)
-        self._starts = [int(start) // 2 for start in self.layout.slope_start]
-        self._slots = {r.sha256: _filled(self.layout, r.R[0], r.Q[0], r.slope_reference, r.command_limit, r.gain,
-                                         r.sha256) for r in supplied or []}  # fmt: skip
-        self._events: list[Any] = []
-        self._states: dict[tuple[int, int], Any] = {}
+        self._slots = {r.sha256: _filled(self.layout, r) for r in supplied or []}
+        self.events: list[Any] = []
+        self.states: dict[_Key, Any] = {}
         self._read_everything_but_frames()
 
     # -- what is not a frame ----------------------------------------------------------------------------------------
@@ -111,42 +101,63 @@ class Replay:
                 yield message.data
 
     def _read_everything_but_frames(self) -> None:
-        manifests = {}
-        for data in self._of(wire.RECONSTRUCTOR):
-            message = decode(wire.RECONSTRUCTOR.type, data)
-            manifests[bytes(message.sha256)] = message
-        blocks: dict[bytes, dict[int, wire.ReconstructorBlock]] = {}
-        for data in self._of(wire.RECONSTRUCTOR_BLOCK):
-            block = wire.read_block(data)
-            blocks.setdefault(block.sha256, {})[block.number] = block
-        for sha256, message in manifests.items():
-            table = block_table(message.n_commands, message.n_epochs)
-            if len(blocks.get(sha256, {})) == len(table) and message.n_slopes == self.layout.n_slopes:
-                R = np.zeros((message.n_commands, message.n_slopes), np.float32)
-                Q = np.zeros((message.n_commands, message.n_commands), np.float32)
-                for block in blocks[sha256].values():
-                    target = R if block.matrix == 0 else Q
-                    target[block.first_row : block.first_row + len(block.rows)] = block.rows
-                self._slots[sha256] = _filled(
-                    self.layout, R, Q, message.slope_reference, message.command_limit, message.gain, sha256
-                )
+        self._read_reconstructors()
         seen = set()
         for data in self._of(wire.EVENT):
             # a late joiner's recorder gets the latched events again
             if data not in seen:
                 seen.add(data)
-                self._events.append(decode(wire.EVENT.type, data))
-        for event in self._events:
+                self.events.append(decode(wire.EVENT.type, data))
+        for event in self.events:
             if event.kernel and event.kernel != KERNEL:
                 raise BagError(
                     f"{self._reader.path}: made with kernel {event.kernel}, this is {KERNEL}: bits would differ"
                 )
-        self.delay = next((float(e.delay) for e in self._events if e.delay > 0), self.system.loop.delay)
         for data in self._of(wire.STATE):
             state = decode(wire.STATE.type, data)
-            self._states[state.session, state.frame] = state
+            self.states[state.session, state.frame] = state
 
-    def _program(self, event: Any) -> Program | None:
+    def _read_reconstructors(self) -> None:
+        manifests = {}
+        for data in self._of(wire.RECONSTRUCTOR):
+            message = decode(wire.RECONSTRUCTOR.type, data)
+            if (message.n_epochs, message.n_commands, message.n_slopes) == (
+                1,
+                self.layout.n_commands,
+                self.layout.n_slopes,
+            ):
+                manifests[bytes(message.sha256)] = message
+        table = block_table(self.layout.n_commands, 1)
+        columns = (self.layout.n_slopes, self.layout.n_commands)
+        matrices = {sha256: [np.full((columns[1], n), np.nan, np.float32) for n in columns] for sha256 in manifests}
+        for data in self._of(wire.RECONSTRUCTOR_BLOCK):
+            try:
+                block = wire.read_block(data)
+            except wire.WireError:
+                continue
+            place = (block.epoch, block.matrix, block.first_row, len(block.rows))
+            if block.sha256 in manifests and place in table and block.rows.shape[1] == columns[block.matrix]:
+                matrices[block.sha256][block.matrix][block.first_row : block.first_row + len(block.rows)] = block.rows
+        for sha256, message in manifests.items():
+            R, Q = matrices[sha256]
+            try:
+                reconstructor = Reconstructor(
+                    fingerprint=bytes(message.fingerprint),
+                    R=R[None],
+                    Q=Q[None],
+                    gain=message.gain,
+                    slope_reference=message.slope_reference,
+                    command_limit=message.command_limit,
+                    probe_commands=message.probe_commands.reshape(-1, self.layout.n_commands),
+                    probe_slopes=message.probe_slopes.reshape(-1, self.layout.n_slopes),
+                )
+            except (ReconstructorError, ValueError):
+                continue  # the HRTC refused it
+            if reconstructor.sha256 == sha256:
+                self._slots[sha256] = _filled(self.layout, reconstructor)
+
+    def program(self, event: Any) -> Program | None:
+        """What the loop runs from an event on; None if its reconstructor is not known."""
         slot = self._slots.get(bytes(event.sha256))
         if slot is None:
             return None
@@ -181,8 +192,10 @@ class Replay:
             raise BagError(f"{self._reader.path}: holds no slopes or no commands")
         total = self._reader.counts[slopes] + self._reader.counts[commands]
         outcome = Outcome()
-        frames: dict[tuple[int, int], _Frame] = {}
-        answers: dict[tuple[int, int], wire.DmCommand] = {}
+        starts = subaperture_starts(self.layout)
+        named = {one.session for one in (*self.events, *self.states.values())}
+        frames: dict[_Key, Exposure] = {}
+        answers: dict[_Key, wire.DmCommand] = {}
         newest: dict[int, int] = {}
         sessions: dict[int, _Session] = {}
         for done, message in enumerate(self._reader.messages(slopes, commands)):
@@ -190,59 +203,70 @@ class Replay:
                 progress(done / total)
             try:
                 if message.topic == slopes:
-                    self._place(wire.read_slope_frame(message.data), frames)
+                    slope_frame = wire.read_slope_frame(message.data)
+                    # the loop dropped all others too
+                    if slope_frame.fingerprint == self.layout.fingerprint and fits(slope_frame, starts):
+                        key = slope_frame.session, slope_frame.frame
+                        if key not in frames and key[0] in named:
+                            frames[key] = Exposure(starts)
+                            if key[0] not in sessions and len(frames) > _WINDOW:
+                                del frames[next(iter(frames))]  # nobody has answered yet
+                        if key in frames:
+                            frames[key].put(slope_frame)
                     continue
                 command = wire.read_dm_command(message.data)
             except wire.WireError:
-                continue  # the loop dropped it too
-            key = command.session, command.frame
-            answers.setdefault(key, command)
-            if command.session not in sessions:
-                sessions[command.session] = _Session(self, command.session, start, outcome)
-            newest[command.session] = max(newest.get(command.session, 0), command.frame)
-            sessions[command.session].advance(newest[command.session] - _WINDOW, frames, answers)
+                continue
+            session = command.session
+            answers.setdefault((session, command.frame), command)
+            if session not in sessions:
+                sessions[session] = _Session(self, session, start, outcome)
+            newest[session] = max(newest.get(session, 0), command.frame)
+            sessions[session].advance(newest[session] - _WINDOW, frames, answers)
         for session, one in sessions.items():
             one.advance(newest[session], frames, answers)
-        outcome.unanswered = len({key for key in frames if key[0] in sessions and key[1] >= start})
+        outcome.unanswered += sum(key[0] in sessions and key[1] >= start for key in frames)
         progress(1.0)
         if outcome.compared == 0:
             raise BagError(f"{self._reader.path}: no frame could be compared. {' '.join(outcome.gaps)}".rstrip())
         return outcome
-
-    def _place(self, message: wire.SlopeFrame, frames: dict[tuple[int, int], _Frame]) -> None:
-        if message.fingerprint != self.layout.fingerprint or message.sensor + message.n_sensors > len(self._starts) - 1:
-            return
-        key = message.session, message.frame
-        if key not in frames:
-            frames[key] = _Frame([None] * (len(self._starts) - 1), [])
-        frame = frames[key]
-        frame.mirror.append((message.mirror_frame, message.mirror_frame_before, message.mirror_fraction))
-        taken = 0
-        for sensor in range(message.sensor, message.sensor + message.n_sensors):
-            n = self._starts[sensor + 1] - self._starts[sensor]
-            count = message.n_subapertures if message.n_sensors == 1 else n
-            first = message.first_subaperture
-            own = frame.slopes[sensor]
-            if own is None:
-                # a packet that never came leaves NaN, which the loop would hold
-                own = frame.slopes[sensor] = np.full(2 * n, np.nan, np.float32)
-            elif count == n:
-                return  # a duplicate: the loop took the first
-            own[first : first + count] = message.slopes[taken : taken + count]
-            own[n + first : n + first + count] = message.slopes[taken + count : taken + 2 * count]
-            taken += 2 * count
 
 
 def _name(verdict: int) -> str:
     return Verdict(verdict).name if verdict in list(Verdict) else str(verdict)
 
 
-def _filled(
-    layout: Layout, R: Floats, Q: Floats, slope_reference: Floats, limit: Floats, gain: float, sha256: bytes
-) -> Slot:
+def _filled(layout: Layout, reconstructor: Reconstructor) -> Slot:
     slot = Slot(layout)
-    slot.fill(R, Q, slope_reference, limit, gain, sha256)
+    slot.fill(
+        reconstructor.R[0],
+        reconstructor.Q[0],
+        reconstructor.slope_reference,
+        reconstructor.command_limit,
+        reconstructor.gain,
+        reconstructor.sha256,
+    )
     return slot
+
+
+class _Entry(NamedTuple):
+    """An event by the first frame that it holds for; ``program`` is the event that says what runs from then on."""
+
+    frame: int
+    event: Any
+    program: Any
+
+
+def _timeline(events: list[Any], session: int) -> list[_Entry]:
+    """The events that change a session's loop. Its beginnings carry over what ran before, whatever session that was."""
+    timeline = []
+    running = None
+    for event in events:
+        if event.kind in PROGRAM_KINDS:
+            running = event
+        if event.session == session and event.kind in (EventKind.SESSION, EventKind.LOOP, *PROGRAM_KINDS):
+            timeline.append(_Entry(int(event.first_frame), event, running if event.reconstructor else None))
+    return timeline
 
 
 class _Session:
@@ -253,158 +277,158 @@ class _Session:
         self._session = session
         self._start = start
         self._outcome = outcome
-        self._loop = Loop(replay.layout, replay.delay)
-        # events of other sessions have no part in this one, but for what was in force before it began
-        events = replay._events
-        own = [i for i, e in enumerate(events) if e.session == session]
-        begin = next((i for i in own if events[i].kind == _SESSION), own[0] if own else len(events))
-        self._events = [e for i, e in enumerate(events) if i < begin and e.kind in _PROGRAM_KINDS]
-        self._events = self._events[-1:] + [events[i] for i in own if i >= begin]
-        self._next_event = 0
+        self._loop = Loop(replay.layout, replay.system.loop.delay)
+        self._timeline = _timeline(replay.events, session)
+        self._next = 0
         self._in_step = False
-        self._frame = 0
-        self._begin()
+        self._lost = f"No recorded state to start from at frame {start}."
+        beginnings = [entry.frame for entry in self._timeline if entry.event.kind == EventKind.SESSION]
+        beginnings += [frame + 1 for of, frame in replay.states if of == session]
+        before = [frame for frame in beginnings if frame <= start]
+        # the last before the start, or else the first after it
+        self._frame = max(before) if before else min(beginnings, default=start)
 
-    def _begin(self) -> None:
-        beginning = next((e for e in self._events if e.kind == _SESSION), None)
-        if beginning is not None and self._start <= beginning.first_frame:
-            self._frame = int(beginning.first_frame)
-            self._in_step = True
-            return
-        self._resume_near(self._start)
-
-    def _resume_near(self, at: int) -> None:
-        """Continue after a recorded state: the last before ``at``, or else the first after it."""
-        frames = sorted(frame for session, frame in self._replay._states if session == self._session)
-        before = [frame for frame in frames if frame < at]
-        after = [frame for frame in frames if frame >= at]
-        if not before and not after:
-            self._in_step = False
-            self._frame = at
-            self._outcome.gaps.append(f"No recorded state to start from at frame {at}.")
-            return
-        self._resume(before[-1] if before else after[0])
-
-    def _resume(self, frame: int) -> bool:
-        state = self._replay._states[self._session, frame]
-        program, passed = None, 0
-        for i, event in enumerate(self._events):
-            if event.session == self._session and event.first_frame > frame:
-                break
-            passed = i + 1
-            if (
-                event.kind in _PROGRAM_KINDS
-                and event.settings == state.settings
-                and bytes(event.sha256) == bytes(state.sha256)
-            ):
-                program = self._replay._program(event)
-        if state.reconstructor and program is None:
-            self._outcome.gaps.append(f"Reconstructor {state.reconstructor:016x} of frame {frame} is not in the bag.")
-            self._in_step = False
-            self._frame = frame + 1
-            return False
-        self._next_event = passed
-        self._loop = Loop(self._replay.layout, self._replay.delay)
-        if program is not None:
-            self._loop.post(program)
-        history = np.asarray(state.history, np.float32).reshape(int(state.n_frames), -1)
-        self._loop.resume(
-            frame,
-            int(state.first_frame),
-            np.asarray(state.state, np.float32),
-            history,
-            bool(state.loop_state),
-            int(state.consecutive_holds),
-        )
-        self._frame = frame + 1
-        self._in_step = True
-        return True
-
-    def advance(
-        self, until: int, frames: dict[tuple[int, int], _Frame], answers: dict[tuple[int, int], wire.DmCommand]
-    ) -> None:
+    def advance(self, until: int, frames: dict[_Key, Exposure], answers: dict[_Key, wire.DmCommand]) -> None:
         """Replay every frame up to ``until``, and forget it."""
         while self._frame <= until:
             key = self._session, self._frame
-            frame, command = frames.pop(key, None), answers.pop(key, None)
-            if not self._in_step and (self._session, self._frame - 1) in self._replay._states:
-                self._resume(self._frame - 1)
-            if not self._in_step:
-                self._outcome.skipped += 1
-                self._frame += 1
-                continue
-            self._apply_events()
-            if self._in_step:
-                self._answer(frame, command)
-            else:
-                self._outcome.skipped += 1
-            self._frame += 1
-        # what lies before the start is of no use any more
+            exposure, command = frames.pop(key, None), answers.pop(key, None)
+            self._reach()
+            if command is None:
+                # the recording lost the answer, or the HRTC was not active: what the loop did is not known
+                self._lose(f"The answer to frame {self._frame} is not in the bag.")
+                if exposure is not None and self._frame >= self._start:
+                    self._outcome.unanswered += 1
+            elif self._in_step:
+                self._answer(exposure, command)
+            if command is not None and not self._in_step:
+                self._skip()
+            self._frame = self._frame + 1 if self._in_step else min(until + 1, self._next_known(frames, answers))
+        # slopes that came again after their answer, or before the first
         for key in [key for key in frames if key[0] == self._session and key[1] < self._frame]:
             del frames[key]
 
-    def _apply_events(self) -> None:
-        loop = self._loop
-        while self._next_event < len(self._events):
-            event = self._events[self._next_event]
-            if event.session == self._session and event.first_frame > self._frame:
-                break
-            self._next_event += 1
-            if event.kind == _SESSION:
-                loop.start(int(event.first_frame), closed=bool(event.loop_state))
-            elif event.kind == _LOOP:
-                loop.request(closed=bool(event.loop_state))
-            elif event.kind in _PROGRAM_KINDS:
-                program = self._replay._program(event)
-                if program is None:
-                    self._outcome.gaps.append(
-                        f"Reconstructor {event.reconstructor:016x}, used from frame {self._frame}, is not in the bag."
-                    )
-                    self._in_step = False
-                else:
-                    loop.post(program)
-        loop.prepare()
+    def _next_known(self, *recorded: dict[_Key, Any]) -> int:
+        """The next frame of which anything is known; a count that jumps far is not walked along."""
+        known = [frame for items in recorded for session, frame in items if session == self._session]
+        known += [frame + 1 for session, frame in self._replay.states if session == self._session]
+        known += [entry.frame for entry in self._timeline]
+        return min((frame for frame in known if frame > self._frame), default=self._frame + 1)
 
-    def _answer(self, frame: _Frame | None, command: wire.DmCommand | None) -> None:
-        loop, outcome = self._loop, self._outcome
-        timed = command is not None and command.verdict in _TIMED
-        complete = frame is not None and all(own is not None for own in frame.slopes)
-        if timed:
-            assert command is not None
-            loop.hold(Verdict(command.verdict))
-        elif complete:
-            assert frame is not None
-            for sensor, own in enumerate(frame.slopes):
-                assert own is not None
-                loop.add(sensor, own)
-            loop.answer(*frame.mirror[0])
-        elif command is not None and command.verdict == Verdict.OPEN:
+    def _lose(self, reason: str) -> None:
+        if self._in_step:
+            self._in_step = False
+            self._lost = reason
+
+    def _skip(self) -> None:
+        if self._frame < self._start:
+            return
+        self._outcome.skipped += 1
+        if self._lost:
+            self._outcome.gaps.append(self._lost)
+            self._lost = ""
+
+    def _reach(self) -> None:
+        """Apply what holds from this frame on; where the record allows, take up a lost thread."""
+        if not self._in_step and (self._session, self._frame - 1) in self._replay.states:
+            self._resume(self._frame - 1)
+        while self._next < len(self._timeline) and self._timeline[self._next].frame <= self._frame:
+            entry = self._timeline[self._next]
+            self._next += 1
+            if entry.event.kind == EventKind.SESSION:
+                self._begin(entry)
+            elif self._in_step and entry.event.kind == EventKind.LOOP:
+                self._loop.request(closed=bool(entry.event.loop_state))
+            elif self._in_step:
+                self._run(entry.program)
+        if self._in_step:
+            self._loop.prepare()
+
+    def _begin(self, entry: _Entry) -> None:
+        if entry.frame != self._frame:
+            return  # the replay starts after it
+        self._loop = Loop(self._replay.layout, entry.event.delay)
+        self._loop.start(entry.frame, closed=bool(entry.event.loop_state))
+        self._in_step = True
+        if entry.program is not None:
+            self._run(entry.program)
+
+    def _run(self, event: Any) -> None:
+        program = self._replay.program(event)
+        if program is None:
+            self._lose(f"Reconstructor {event.reconstructor:016x}, in use at frame {self._frame}, is not in the bag.")
+        else:
+            self._loop.post(program)
+
+    def _resume(self, frame: int) -> None:
+        state = self._replay.states[self._session, frame]
+        running, delay = None, self._replay.system.loop.delay
+        for event in self._replay.events:
+            if event.session == self._session and event.first_frame > frame:
+                break
+            delay = event.delay or delay
+            if (
+                event.kind in PROGRAM_KINDS
+                and event.settings == state.settings
+                and bytes(event.sha256) == bytes(state.sha256)
+            ):
+                running = event
+        self._next = sum(entry.frame <= frame for entry in self._timeline)
+        self._loop = Loop(self._replay.layout, delay)
+        self._in_step = True
+        if state.reconstructor and running is None:
+            self._lose(f"Settings and reconstructor in use at frame {frame} are not in the bag.")
+        elif state.reconstructor:
+            self._run(running)
+        if self._in_step:
+            history = np.asarray(state.history, np.float32).reshape(int(state.n_frames), -1)
+            self._loop.resume(
+                frame,
+                int(state.first_frame),
+                np.asarray(state.state, np.float32),
+                history,
+                bool(state.loop_state),
+                int(state.consecutive_holds),
+            )
+
+    def _answer(self, exposure: Exposure | None, command: wire.DmCommand) -> None:
+        loop = self._loop
+        if command.verdict == Verdict.OPEN and command.sensors == 0:
             # the flat that a stopping HRTC leaves behind answers no slopes
             loop.state[:] = 0
             loop.hold(Verdict.OPEN)
+        elif command.verdict in _TIMED:
+            loop.hold(Verdict(command.verdict))
+        elif exposure is not None and exposure.arrived == loop.all_sensors:
+            for sensor, own in enumerate(exposure.slopes):
+                loop.add(sensor, own)
+            loop.answer(*exposure.mirror)
+        elif command.verdict in list(Verdict) and command.verdict != Verdict.OK:
+            loop.hold(Verdict(command.verdict))  # whatever the slopes were, they were not used
         else:
-            self._in_step = False
-            outcome.skipped += 1
-            outcome.gaps.append(f"Slopes of frame {self._frame} are not in the bag: on from the next recorded state.")
+            self._lose(f"Slopes of frame {self._frame} are not in the bag.")
             return
-        if command is None:
-            return
-        if self._frame < self._start:
-            return
+        if self._frame >= self._start:
+            self._compare(command)
+
+    def _compare(self, command: wire.DmCommand) -> None:
+        loop, outcome = self._loop, self._outcome
         outcome.first_frame = self._frame if outcome.first_frame is None else outcome.first_frame
         outcome.last_frame = self._frame
         outcome.compared += 1
         outcome.held += loop.verdict not in (Verdict.OK, Verdict.OPEN)
         identity = loop.program.slot.id if loop.program is not None else 0
         if command.verdict != loop.verdict:
-            outcome.note_difference(self._frame, f"verdict {_name(command.verdict)} recorded, {loop.verdict.name} now")
+            what = f"verdict {_name(command.verdict)} recorded, {loop.verdict.name} now"
         elif command.reconstructor != identity:
-            outcome.note_difference(
-                self._frame, f"reconstructor {command.reconstructor:016x} recorded, {identity:016x} now"
-            )
+            what = f"reconstructor {command.reconstructor:016x} recorded, {identity:016x} now"
+        elif len(command.commands) != len(loop.command):
+            what = f"{len(command.commands)} commands recorded, {len(loop.command)} now"
         else:
             different = command.commands.view(np.uint32) != loop.command.view(np.uint32)
-            if different.any():
-                worst = float(np.nanmax(np.abs(command.commands - loop.command)))
-                size = f", by {worst:.2g} m at most" if math.isfinite(worst) else ""
-                outcome.note_difference(self._frame, f"{int(different.sum())} commands{size}")
+            if not different.any():
+                return
+            worst = float(np.nanmax(np.abs(command.commands - loop.command)))
+            size = f", by {worst:.2g} m at most" if math.isfinite(worst) else ""
+            what = f"{int(different.sum())} commands{size}"
+        outcome.note_difference(self._frame, what)

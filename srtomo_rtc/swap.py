@@ -5,7 +5,8 @@ when the last row is in, the whole is checked (:meth:`Swap.check`), copied into 
 touched until warm. Nothing reaches the loop before :meth:`Swap.commit`, which posts one reference. There are three
 slots: active, staged and previous.
 
-Threads: one thread at a time, any but the loop's, calls everything here; the node keeps them on one executor thread.
+Threads: one thread at a time, any but the loop's, calls everything here; the node has a worker for it. Attributes and
+``missing`` may be read from any thread.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse.linalg import ArpackNoConvergence, eigs
+from scipy.sparse.linalg import ArpackError, eigs
 
 from srtomo_core.layout import Layout
 from srtomo_core.reconstructor import Reconstructor, ReconstructorError, block_table
@@ -92,7 +93,7 @@ def spectral_radius(matrix: NDArray[np.float64]) -> float:
             start = np.random.default_rng(0).standard_normal(len(matrix))
             values = eigs(matrix, k=4, which="LM", v0=start, return_eigenvectors=False, maxiter=2000, tol=1e-6)
             return float(np.abs(values).max())
-        except ArpackNoConvergence:
+        except ArpackError:  # no convergence, or nothing to start from: a matrix of zeros
             pass
     return float(np.abs(np.linalg.eigvals(matrix)).max())
 
@@ -179,12 +180,18 @@ class Swap:
         layout, system: the instrument.
         G_cal: (n_slopes, n_commands) calibrated interaction matrix, rad/m.
         settings: at the start.
-        post: hands a Program to the loop (``Loop.post``).
+        post: hands a Program to the loop (``Loop.post``), which must have taken it up before the next one is posted, or
+            else run no frame before: slots are used again.
+
+    Raises:
+        ValueError: G_cal is not of the instrument's shape.
     """
 
     def __init__(
         self, system: System, layout: Layout, G_cal: Floats, settings: Settings, post: Callable[[Program], None]
     ) -> None:
+        if G_cal.shape != (layout.n_slopes, layout.n_commands):
+            raise ValueError(f"G_cal: expected shape {(layout.n_slopes, layout.n_commands)}, got {G_cal.shape}")
         self._layout = layout
         self._G_cal = G_cal
         self._tip_tilt = any(star.tip_tilt == "seen" for star in map(system.star_of, system.sensors))
@@ -194,7 +201,7 @@ class Swap:
         self._R = np.zeros((layout.n_commands, layout.n_slopes), np.float32)
         self._Q = np.zeros((layout.n_commands, layout.n_commands), np.float32)
         self._table: list[tuple[int, int, int, int]] = []
-        self._waiting: set[int] = set()
+        self._waiting: frozenset[int] = frozenset()
         self.settings = settings
         self.active: Held | None = None
         self.staged: Held | None = None
@@ -227,9 +234,9 @@ class Swap:
             raise Refused(f"expected {len(table)} blocks, got {manifest.n_blocks}")
         if len(manifest.probe_commands) % layout.n_commands or len(manifest.probe_slopes) % layout.n_slopes:
             raise Refused("probe_commands, probe_slopes: expected whole vectors")
-        self._manifest = manifest
         self._table = table
-        self._waiting = set(range(len(table)))
+        self._waiting = frozenset(range(len(table)))
+        self._manifest = manifest
 
     def take(self, block: ReconstructorBlock) -> bool:
         """Put one block in its place; blocks of other transfers are ignored. True when it was the last one.
@@ -251,15 +258,16 @@ class Swap:
             self._manifest = None
             raise Refused(f"block {block.number}: expected {rows} rows x {target.shape[1]}, got {block.rows.shape}")
         target[first : first + rows] = block.rows
-        self._waiting.remove(block.number)
+        self._waiting -= {block.number}
         return not self._waiting
 
     @property
     def missing(self) -> tuple[int, list[int]] | None:
         """(id, block indices) of the transfer under way, if any is."""
-        if self._manifest is None or not self._waiting:
+        manifest, waiting = self._manifest, self._waiting
+        if manifest is None or not waiting:
             return None
-        return self._manifest.id, sorted(self._waiting)
+        return manifest.id, sorted(waiting)
 
     def stage(self) -> Held:
         """Check what was transferred and put it, warm, into the staged slot.
@@ -341,8 +349,10 @@ class Swap:
     def _run(self, held: Held | None, identity: int, sha256: bytes, where: str) -> Program:
         if held is None:
             raise Refused(f"no reconstructor is {where}")
-        if (held.slot.id, held.slot.sha256) != (identity, sha256):
+        if held.slot.id != identity:
             raise Refused(f"reconstructor {identity:016x} is not {where}: that is {held.slot.id:016x}")
+        if held.slot.sha256 != sha256:
+            raise Refused(f"reconstructor {identity:016x} has SHA-256 {held.slot.sha256.hex()}, got {sha256.hex()}")
         program = Program(held.slot, self.settings)
         self._post(program)
         return program

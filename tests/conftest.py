@@ -9,7 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import pytest
@@ -60,6 +60,11 @@ class NodeProcess:
         self._process.send_signal(signal.SIGINT)
         return self.wait(timeout)
 
+    def terminate(self, timeout: float = 30.0) -> int:
+        """SIGTERM; returns its exit status."""
+        self._process.send_signal(signal.SIGTERM)
+        return self.wait(timeout)
+
     def kill(self) -> None:
         """kill -9."""
         self._process.kill()
@@ -86,28 +91,52 @@ def _clean_shared_memory() -> Iterator[None]:
         subprocess.run([tool, "shm", "clean"], capture_output=True, timeout=30, check=False)
 
 
-@pytest.fixture
-def ros_domain(monkeypatch: pytest.MonkeyPatch, _clean_shared_memory: None) -> Iterator[int]:
-    """A free ROS domain on this host alone, in the environment of this process and those that it starts."""
+@contextmanager
+def _own_domain() -> Iterator[int]:
     pytest.importorskip("rclpy", reason=NEEDS_ROS)
     from domain_coordinator import domain_id
 
-    with domain_id() as number:
-        monkeypatch.setenv("ROS_DOMAIN_ID", str(number))
-        monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    with domain_id() as number, pytest.MonkeyPatch.context() as patch:
+        patch.setenv("ROS_DOMAIN_ID", str(number))
+        patch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+        patch.setenv("FASTDDS_BUILTIN_TRANSPORTS", "SHM")
+        yield number
+
+
+@contextmanager
+def _processes(folder: Path) -> Iterator[StartProcess]:
+    processes: list[NodeProcess] = []
+
+    def start(*arguments: str | Path) -> NodeProcess:
+        log = folder / f"process_{len(processes)}.log"
+        processes.append(NodeProcess(tuple(map(str, arguments)), log))
+        return processes[-1]
+
+    try:
+        yield start
+    finally:
+        for process in reversed(processes):
+            process.end()
+
+
+@pytest.fixture
+def ros_domain(_clean_shared_memory: None) -> Iterator[int]:
+    """A free ROS domain on this host alone, in the environment of this process and those that it starts."""
+    with _own_domain() as number:
         yield number
 
 
 @pytest.fixture
 def start_process(ros_domain: int, tmp_path: Path) -> Iterator[StartProcess]:
     """Starts ``python ARGUMENTS...`` in the test's domain and folder, e.g. ``start_process("-m", "package.node")``."""
-    processes: list[NodeProcess] = []
+    with _processes(tmp_path) as start:
+        yield start
 
-    def start(*arguments: str | Path) -> NodeProcess:
-        log = tmp_path / f"process_{len(processes)}.log"
-        processes.append(NodeProcess(tuple(map(str, arguments)), log))
-        return processes[-1]
 
-    yield start
-    for process in reversed(processes):
-        process.end()
+@pytest.fixture(scope="module")
+def start_shared_process(
+    _clean_shared_memory: None, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[StartProcess]:
+    """As ``start_process``, in a domain and a folder for all tests of a module."""
+    with _own_domain(), _processes(tmp_path_factory.mktemp("processes")) as start:
+        yield start

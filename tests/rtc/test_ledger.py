@@ -193,3 +193,20 @@ def test_sessions_are_books_of_their_own():
         instrument.ledger.add_slopes(other.write(0, frame, -1, -1, 1.0))
     assert instrument.ledger.lost == (1, 0)
     assert [session["session"] for session in instrument.ledger.report()] == [SESSION, 7]
+
+
+def test_the_flat_that_a_stopping_hrtc_leaves_is_no_loss():
+    """It answers no slopes: the sensors may have stopped before, or go on."""
+    instrument = Instrument()
+    for frame in range(10):
+        instrument.slopes(0, frame)
+        instrument.slopes(1, frame)
+        instrument.commands(frame)
+    fields = (SESSION, 10, 0, 0, 0, 1, 0, 0, 0.5, -1, -1, 1.0, 1e-4)
+    instrument.ledger.add_command(instrument.command_writer.write(0, 0, *fields))
+    instrument.now += 1
+    assert instrument.ledger.lost == (0, 0)
+    instrument.slopes(0, 10)
+    instrument.slopes(1, 10)
+    instrument.now += 1
+    assert (instrument.ledger.lost, instrument.ledger.frames) == ((0, 0), 11)

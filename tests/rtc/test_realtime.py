@@ -1,0 +1,83 @@
+"""Real-time settings in processes of their own: applied, or reported with the reason."""
+
+import os
+import resource
+import subprocess
+import sys
+
+import pytest
+
+from srtomo_rtc import realtime
+
+
+def run(code: str, **environment: str) -> str:
+    """Standard output of a new Python; its variables for BLAS threads are those given alone."""
+    kept = {name: value for name, value in os.environ.items() if not name.endswith("_NUM_THREADS")}
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        env={**kept, **environment},
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=True,
+    )
+    return done.stdout.strip()
+
+
+PIN = "from srtomo_rtc import realtime; print(realtime.pin_blas())"
+
+
+def test_blas_threads_are_pinned_before_numpy():
+    assert run(PIN) == "blas threads 1"
+    assert run(f"{PIN}; import os; print(os.environ['OPENBLAS_NUM_THREADS'])").splitlines()[1] == "1"
+    assert run(f"import numpy; {PIN}") == "blas threads refused: numpy was loaded first (unset threads)"
+    assert run(f"import numpy; {PIN}", OPENBLAS_NUM_THREADS="4").endswith("(4 threads)")
+    assert run(f"import numpy; {PIN}", OPENBLAS_NUM_THREADS="1") == "blas threads 1"
+
+
+def test_the_module_itself_does_not_load_numpy():
+    assert run("import sys; from srtomo_rtc import realtime; print('numpy' in sys.modules)") == "False"
+
+
+def test_memory_is_locked_or_the_reason_told():
+    code = (
+        "from srtomo_rtc import realtime; print(realtime.lock_memory());"
+        "print(next(line.split()[1] for line in open('/proc/self/status') if line.startswith('VmLck')))"
+    )
+    outcome, locked = run(code).splitlines()
+    assert (outcome == "memory lock on") == (int(locked) > 0)
+    assert outcome == "memory lock on" or outcome.startswith("memory lock refused: ")
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="the limit does not bind root")
+def test_memory_is_not_locked_under_a_limit():
+    """Locking future pages under a limit would turn a later allocation into a crash."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_MEMLOCK)
+    if soft == resource.RLIM_INFINITY:
+        resource.setrlimit(resource.RLIMIT_MEMLOCK, (1 << 20, hard))
+    try:
+        assert not realtime.lock_memory().applied
+    finally:
+        resource.setrlimit(resource.RLIMIT_MEMLOCK, (soft, hard))
+
+
+def test_priority():
+    code = (
+        "import os; from srtomo_rtc import realtime; print(realtime.fifo_priority({})); print(os.sched_getscheduler(0))"
+    )
+    assert run(code.format(0)).splitlines() == ["SCHED_FIFO not asked for", str(os.SCHED_OTHER)]
+    outcome, policy = run(code.format(5)).splitlines()
+    if outcome == "SCHED_FIFO 5":
+        assert policy == str(os.SCHED_FIFO)
+    else:
+        assert outcome.startswith("SCHED_FIFO refused: ") and "RLIMIT_RTPRIO" in outcome
+        assert policy == str(os.SCHED_OTHER)
+    assert run(code.format(1000)).startswith("SCHED_FIFO refused: ")
+
+
+def test_the_interpreter_is_quiet():
+    code = (
+        "import gc, sys; from srtomo_rtc import realtime; print(realtime.quiet_interpreter());"
+        "print(gc.get_freeze_count() > 1000, sys.getswitchinterval())"
+    )
+    assert run(code).splitlines() == ["garbage collection frozen", "True 0.0005"]
