@@ -1,13 +1,17 @@
 """Covariances of wavefronts and slopes, summed over the layers (eq. 14 and 23), in optical path.
 
-Everything goes layer by layer through node pairs, so that stars at different distances, shifts and rotations need no
-case of their own; sparse gradient operators then turn nodes into slopes.
+Wavefronts are correlated at nodes, and sparse gradient operators turn nodes into slopes, block by block, so that no
+covariance of nodes is ever whole. Node pairs go layer by layer, and stars at different distances, shifts and rotations
+need no case of their own; or they go through tables (:mod:`srtomo_srtc.lattice`), wherever these are exact, and with
+``fast`` also where they interpolate.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
+from itertools import pairwise
 
 import numba
 import numpy as np
@@ -15,9 +19,15 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from srtomo_srtc.atmosphere import CovarianceTable, Profile
-from srtomo_srtc.geometry import Footprints
+from srtomo_srtc.geometry import Footprints, SeenLattice
+from srtomo_srtc.lattice import PairTable, is_on_lattice
+from srtomo_srtc.parallel import Progress, run, silent
+from srtomo_srtc.solve import SymmetricTiles
 
 Array = NDArray[np.float64]
+Matrix = NDArray[np.floating]
+
+_CHUNK = 2**23  # entries of a block of nodes and slopes that are held at a time
 
 
 @dataclass(frozen=True)
@@ -27,10 +37,16 @@ class Sightline:
     Attributes:
         nodes: on the profile's layers.
         gradient: (n_slopes, n_nodes) 1/m.
+        seen: the same nodes as a lattice; without it, everything goes layer by layer.
     """
 
     nodes: Footprints
     gradient: sparse.csr_array
+    seen: SeenLattice | None = None
+
+    def only(self, layers: slice) -> Sightline:
+        """The same on some of the layers."""
+        return Sightline(self.nodes.only(layers), self.gradient, self.seen and self.seen.only(layers))
 
 
 @dataclass(frozen=True)
@@ -51,6 +67,10 @@ class Turbulence:
         reach = float(np.hypot(x_span, y_span).max())
         return cls(profile.fractions, CovarianceTable.build(profile.r0, profile.outer_scale, reach))
 
+    def only(self, layers: slice) -> Turbulence:
+        """Some of the layers."""
+        return Turbulence(self.fractions[layers], self.table)
+
 
 def wavefront_covariance(turbulence: Turbulence, a: Footprints, b: Footprints) -> Array:
     """Covariance between wavefronts at two sets of points, less the constant C(0) that piston removal takes out.
@@ -58,29 +78,56 @@ def wavefront_covariance(turbulence: Turbulence, a: Footprints, b: Footprints) -
     Returns:
         (n_a, n_b) m^2.
     """
-    out = np.empty((a.x.shape[1], b.x.shape[1]))
+    return np.asarray(_covariance(turbulence, a, b, np.float64), np.float64)
+
+
+def _covariance(turbulence: Turbulence, a: Footprints, b: Footprints, dtype: type[np.floating]) -> Matrix:
     table = turbulence.table
-    _sum_layers(a.x, a.y, b.x, b.y, turbulence.fractions, table.values, 1 / table.step, out)
+    out = np.empty((a.x.shape[1], b.x.shape[1]), dtype)
+    inputs = (a.x, a.y, b.x, b.y, turbulence.fractions, table.values)
+    _sum_layers(*(np.ascontiguousarray(values, dtype) for values in inputs), dtype(1 / table.step), out)
     return out
 
 
-def slope_covariance(turbulence: Turbulence, sensors: Sequence[Sightline]) -> Array:
+def slope_covariance(
+    turbulence: Turbulence, sensors: Sequence[Sightline], *, fast: bool = False, threads: int = 1
+) -> Array:
     """Covariance of all slopes with each other, Sigma_ss.
 
+    Args:
+        fast: see :func:`slope_tiles`.
+
     Returns:
-        (n_slopes, n_slopes) rad^2, exactly symmetric.
+        (n_slopes, n_slopes) rad^2, float64, exactly symmetric.
     """
-    starts = np.cumsum([0] + [sensor.gradient.shape[0] for sensor in sensors])
-    out = np.empty((starts[-1], starts[-1]))
+    return np.asarray(slope_tiles(turbulence, sensors, fast=fast, threads=threads).dense(), np.float64)
+
+
+def slope_tiles(
+    turbulence: Turbulence,
+    sensors: Sequence[Sightline],
+    *,
+    fast: bool = False,
+    threads: int = 1,
+    progress: Progress = silent,
+) -> SymmetricTiles:
+    """As :func:`slope_covariance`, but half of the matrix, ready to be factored.
+
+    Args:
+        fast: float32, and tables also for sensors that are rotated against each other: wrong by less than 1e-4 of the
+            norm there.
+    """
+    starts = [0, *np.cumsum([sensor.gradient.shape[0] for sensor in sensors]).tolist()]
+    out = SymmetricTiles(starts[-1], np.float32 if fast else np.float64)
+    tasks: list[Callable[[], None]] = []
     for i, first in enumerate(sensors):
         for j, second in enumerate(sensors[: i + 1]):
-            nodes = wavefront_covariance(turbulence, first.nodes, second.nodes)
-            block = second.gradient @ (first.gradient @ nodes).T
-            if i == j:
-                block = np.triu(block) + np.triu(block, 1).T
-            rows, columns = slice(starts[i], starts[i + 1]), slice(starts[j], starts[j + 1])
-            out[columns, rows] = block
-            out[rows, columns] = block.T
+            correlate = _node_correlation(turbulence, first, second, fast)
+            tasks += [
+                partial(_write_slopes, out, correlate, first.gradient, subapertures, starts[i], starts[j])
+                for subapertures in _stretches(first.gradient.shape[0] // 2, 4 * second.gradient.shape[0])
+            ]
+    run(tasks, threads, progress)
     return out
 
 
@@ -93,16 +140,124 @@ def slope_wavefront_covariance(turbulence: Turbulence, sensors: Sequence[Sightli
     return np.concatenate([s.gradient @ wavefront_covariance(turbulence, s.nodes, points) for s in sensors])
 
 
+@dataclass(frozen=True)
+class Share:
+    """Wavefront at points of some layers, and what it counts in each of several weighted sums.
+
+    Attributes:
+        layers: of the profile, on which the points are.
+        points: on these layers.
+        weights: (n_points, n_sums).
+    """
+
+    layers: slice
+    points: Footprints
+    weights: sparse.csr_array
+
+
+def slope_products(
+    turbulence: Turbulence,
+    sensors: Sequence[Sightline],
+    shares: Sequence[Share],
+    *,
+    fast: bool = False,
+    threads: int = 1,
+    progress: Progress = silent,
+) -> Array:
+    """Covariance of weighted sums of the wavefront with all slopes, ``sum over shares of weights^T Sigma_phi_s``.
+
+    Sigma_phi_s exists only for a stretch of points and one sensor at a time. Points that are near each other should
+    follow each other: then few sums have any weight in a stretch, and only those cost.
+
+    Args:
+        fast: float32.
+
+    Returns:
+        (n_sums, n_slopes).
+    """
+    starts = np.cumsum([0] + [sensor.gradient.shape[0] for sensor in sensors])
+    dtype = np.float32 if fast else np.float64
+    out = np.zeros((shares[0].weights.shape[1], starts[-1]), dtype)
+
+    def add(sensor: Sightline, slopes: slice, share: Share) -> None:
+        layers, seen = turbulence.only(share.layers), sensor.only(share.layers)
+        mine = out[:, slopes]
+        for points in _stretches(share.weights.shape[0], 4 * mine.shape[1]):
+            weights = share.weights[points]
+            sums, columns = np.unique(weights.indices, return_inverse=True)
+            dense = np.zeros((weights.shape[0], len(sums)), dtype)
+            dense[np.repeat(np.arange(weights.shape[0]), np.diff(weights.indptr)), columns] = weights.data
+            mine[sums] += dense.T @ _slopes_with_points(layers, seen, share.points, points, dtype).T
+
+    def add_all(sensor: Sightline, slopes: slice) -> None:
+        for share in shares:
+            add(sensor, slopes, share)
+
+    slices = [slice(*pair) for pair in pairwise(starts)]
+    run([partial(add_all, *pair) for pair in zip(sensors, slices)], threads, progress)
+    return out
+
+
+Correlate = Callable[[slice], Matrix]
+"""Covariance of a stretch of points with all slopes of one sensor: (n_points, n_slopes) rad m."""
+
+
+def _node_correlation(turbulence: Turbulence, first: Sightline, second: Sightline, fast: bool) -> Correlate:
+    """Of the first sensor's nodes with the second sensor's slopes."""
+    a, b = first.seen, second.seen
+    if a is not None and b is not None and np.array_equal(a.cones, b.cones):
+        centres = b.lattice.to_steps(*a.lattice.points())
+        if fast or is_on_lattice(centres):
+            table = PairTable.build(
+                b.lattice, centres, b.cones, b.offsets - a.offsets, turbulence.fractions, turbulence.table
+            )
+            return partial(table.slopes, second.gradient)
+    return lambda nodes: _slopes_with_points(turbulence, second, first.nodes, nodes, np.float64).T
+
+
+def _slopes_with_points(
+    turbulence: Turbulence, sensor: Sightline, points: Footprints, stretch: slice, dtype: type[np.floating]
+) -> Matrix:
+    """(n_slopes, length of the stretch) rad m."""
+    some = Footprints(points.x[:, stretch], points.y[:, stretch])
+    return np.asarray(sensor.gradient.astype(dtype) @ _covariance(turbulence, sensor.nodes, some, dtype))
+
+
+def _write_slopes(
+    out: SymmetricTiles,
+    correlate: Correlate,
+    gradient: sparse.csr_array,
+    subapertures: slice,
+    row: int,
+    column: int,
+) -> None:
+    """The slopes of some of a sensor's sub-apertures with all of another's, which begin at ``row`` and ``column``."""
+    n_valid = gradient.shape[0] // 2
+    both = [gradient[subapertures], gradient[n_valid + subapertures.start : n_valid + subapertures.stop]]
+    used = np.concatenate([part.indices for part in both])
+    nodes = slice(int(used.min()), int(used.max()) + 1)
+    correlated = correlate(nodes)
+    for axis, part in enumerate(both):
+        out.write(row + axis * n_valid + subapertures.start, column, part[:, nodes] @ correlated)
+
+
+def _stretches(n: int, width: int) -> Iterator[slice]:
+    """0 .. n in stretches of about equal length, short enough for blocks of ``width`` columns."""
+    pieces = -(-n * width // _CHUNK)
+    return (slice(*pair) for pair in pairwise([n * i // pieces for i in range(pieces + 1)]))
+
+
 @numba.njit(cache=True, nogil=True, fastmath={"contract"})
 def _sum_layers(
-    ax: Array, ay: Array, bx: Array, by: Array, fractions: Array, table: Array, per_step: float, out: Array
+    ax: Matrix, ay: Matrix, bx: Matrix, by: Matrix, fractions: Matrix, table: Matrix, per_step: float, out: Matrix
 ) -> None:
     n = bx.shape[1]
-    index = np.empty(n, np.int32)
-    beyond = np.empty(n)
+    # unsigned: an index that can count from the end costs a test
+    index = np.empty(n, np.uint32)
+    beyond = np.empty(n, table.dtype)
     for p in range(ax.shape[1]):
         row = out[p]
-        row[:] = 0.0
+        row[:] = 0
         for l in range(len(fractions)):
             x, y, fraction = ax[l, p], ay[l, p], fractions[l]
             # apart from the look-ups this loop vectorises: together they take twice as long
@@ -115,4 +270,4 @@ def _sum_layers(
                 beyond[q] = t - i
             for q in range(n):
                 value = table[index[q]]
-                row[q] += fraction * (value + beyond[q] * (table[index[q] + 1] - value))
+                row[q] += fraction * (value + beyond[q] * (table[index[q] + np.uint32(1)] - value))

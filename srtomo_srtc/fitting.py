@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from typing import NamedTuple
+from dataclasses import dataclass
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
+from scipy import sparse
 from scipy.linalg import cho_factor, cho_solve
 
 from srtomo_core.layout import Layout
 from srtomo_core.system import Direction, System
 from srtomo_srtc.geometry import Footprints, footprints, pupil_grid
-from srtomo_srtc.mirrors import mirror_wavefronts
+from srtomo_srtc.mirrors import sparse_wavefronts
 
 Array = NDArray[np.float64]
 
@@ -23,19 +25,32 @@ KAPPA = 1e-4
 _POINTS_PER_PITCH = 2  # finer changes the residual by less than 0.05 nm
 
 
-class View(NamedTuple):
+@dataclass(frozen=True)
+class View:
     """One science direction of the fit.
 
     Attributes:
         direction: rad.
         weight: of the direction; all sum to 1.
-        projection: (n_commands, n_points) ``w N^T W``, piston taken out: what turns a wavefront into its share of the
-            normal equations' right-hand side.
+        light: (n_points,) W, the pupil's weights; they sum to 1.
+        modes: (n_points, n_commands) N, the mirrors' wavefronts.
     """
 
     direction: Direction
     weight: float
-    projection: Array
+    light: Array
+    modes: sparse.csr_array
+
+    @property
+    def pistons(self) -> Array:
+        """(n_commands,) mean of each mode over the pupil."""
+        return np.asarray(self.light @ self.modes)
+
+    @property
+    def projection(self) -> Array:
+        """(n_commands, n_points) ``w N^T W``, piston taken out: what turns a wavefront into its share of the normal
+        equations' right-hand side. Dense, and made anew each time."""
+        return np.asarray((self.modes.toarray() - self.pistons).T * (self.weight * self.light))
 
 
 class Fit:
@@ -43,7 +58,7 @@ class Fit:
 
     Attributes:
         grid: pupil points and their weights W.
-        views: the science directions.
+        views: the science directions of any weight.
         normal: (n_commands, n_commands) with kappa in it.
     """
 
@@ -59,12 +74,13 @@ class Fit:
         self.views: list[View] = []
         self.normal = np.zeros((layout.n_commands, layout.n_commands))
         for target in system.science.targets:
-            modes = mirror_wavefronts(layout, self.grid.x, self.grid.y, target.position)
-            modes -= self.grid.weight @ modes
-            weight = target.weight / total
-            projection = modes.T * (weight * self.grid.weight)
-            self.normal += projection @ modes
-            self.views.append(View(target.position, weight, projection))
+            if target.weight == 0:
+                continue
+            modes = sparse_wavefronts(layout, self.grid.x, self.grid.y, target.position)
+            view = View(target.position, target.weight / total, self.grid.weight, modes)
+            _add_products(modes.indptr, modes.indices, modes.data, view.weight * view.light, self.normal)
+            self.normal -= view.weight * np.outer(view.pistons, view.pistons)
+            self.views.append(view)
         self.normal[np.diag_indices_from(self.normal)] += kappa * self.normal.trace() / len(self.normal)
         self._factor = cho_factor(self.normal)
 
@@ -76,3 +92,15 @@ class Fit:
     def solve(self, right: Array) -> Array:
         """Commands (n_commands, n) from the right-hand side (n_commands, n) of the normal equations."""
         return cho_solve(self._factor, right)
+
+
+@numba.njit(cache=True, nogil=True)
+def _add_products(
+    indptr: NDArray[np.integer], indices: NDArray[np.integer], data: Array, weight: Array, out: Array
+) -> None:
+    """``out += N^T diag(weight) N``."""
+    for p in range(len(weight)):
+        for a in range(indptr[p], indptr[p + 1]):
+            value, row = weight[p] * data[a], out[indices[a]]
+            for b in range(indptr[p], indptr[p + 1]):
+                row[indices[b]] += value * data[b]

@@ -27,6 +27,10 @@ class Footprints:
     x: Array
     y: Array
 
+    def only(self, layers: slice) -> Footprints:
+        """The same on some of the layers."""
+        return Footprints(self.x[layers], self.y[layers])
+
 
 def footprints(x: Array, y: Array, direction: Direction, distance: float, heights: Array) -> Footprints:
     """Follow pupil points towards a star: ``xi_l x + h_l alpha`` with ``xi_l = 1 - h_l / distance`` (eq. 26).
@@ -40,6 +44,76 @@ def footprints(x: Array, y: Array, direction: Direction, distance: float, height
     h = heights[:, None]
     cone = 1 - h / distance
     return Footprints(cone * x + h * direction.x, cone * y + h * direction.y)
+
+
+@dataclass(frozen=True)
+class Lattice:
+    """A sensor's nodes as part of a square lattice in its own axes.
+
+    Attributes:
+        step: m.
+        origin: x, y of row 0 and column 0 in the sensor's own axes, m.
+        rotation: rad; applied before the shift.
+        shift: x, y, m.
+        row, column: (n_nodes,) of each node; in C order.
+    """
+
+    step: float
+    origin: tuple[float, float]
+    rotation: float
+    shift: tuple[float, float]
+    row: NDArray[np.int64]
+    column: NDArray[np.int64]
+
+    def points(self) -> tuple[Array, Array]:
+        """x, y of the nodes in the pupil, m."""
+        x, y = self.origin[0] + self.step * self.column, self.origin[1] + self.step * self.row
+        c, s = math.cos(self.rotation), math.sin(self.rotation)
+        return c * x - s * y + self.shift[0], s * x + c * y + self.shift[1]
+
+    def to_steps(self, x: Array, y: Array) -> Array:
+        """(n_points, 2) row and column, not whole, of points (n_points,) in the pupil (m)."""
+        x, y = x - self.shift[0], y - self.shift[1]
+        c, s = math.cos(self.rotation), math.sin(self.rotation)
+        return np.stack([c * y - s * x - self.origin[1], c * x + s * y - self.origin[0]], axis=-1) / self.step
+
+    def rows(self, multiple: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """The rows of the lattice that have nodes, in pieces of a multiple of so many columns.
+
+        Returns:
+            (n_rows, 3) each row, its first column and the number of columns.
+            (n_nodes,) where each node is when these rows follow each other.
+        """
+        rows, begins = np.unique(self.row, return_index=True)
+        first = self.column[begins]
+        length = self.column[np.append(begins[1:], len(self.row)) - 1] - first + 1
+        length = -(-length // multiple) * multiple
+        which = np.searchsorted(rows, self.row)
+        place = (np.cumsum(length) - length - first)[which] + self.column
+        return np.stack([rows, first, length], axis=1), place
+
+
+@dataclass(frozen=True)
+class SeenLattice:
+    """A sensor's lattice on every layer: ``cone * (point in the pupil) + offset``.
+
+    Attributes:
+        cones: (n_layers,)
+        offsets: (n_layers, 2) x, y, m.
+    """
+
+    lattice: Lattice
+    cones: Array
+    offsets: Array
+
+    @classmethod
+    def towards(cls, lattice: Lattice, direction: Direction, distance: float, heights: Array) -> SeenLattice:
+        """As :func:`footprints` has it."""
+        return cls(lattice, 1 - heights / distance, heights[:, None] * np.array([direction.x, direction.y]))
+
+    def only(self, layers: slice) -> SeenLattice:
+        """The same on some of the layers."""
+        return SeenLattice(self.lattice, self.cones[layers], self.offsets[layers])
 
 
 @dataclass(frozen=True)

@@ -22,14 +22,16 @@ from scipy import sparse
 
 from srtomo_core.layout import SensorLayout
 from srtomo_core.system import Telescope
-from srtomo_srtc.geometry import cell_light
+from srtomo_srtc.geometry import Lattice, cell_light
 
 Array = NDArray[np.float64]
 
 LARGEST_SUBAPERTURE = 0.5
 """A larger sub-aperture (a one-lens tip-tilt sensor's) is divided until its parts are no larger than this, m."""
 
-_OVERSAMPLING = 2  # node cells across a sub-aperture, or across such a part of one
+OVERSAMPLING = 2
+"""Default number of node cells across a sub-aperture, or across such a part of one."""
+
 _FINE = 16  # points across a node cell when its light is averaged
 
 
@@ -41,20 +43,25 @@ class GradientOperator:
         x, y: (n_nodes,) nodes in pupil coordinates, m.
         matrix: (n_slopes, n_nodes) 1/m: metres of wavefront to radians of tilt, all x then all y, along the sensor's
             own axes.
+        lattice: the same nodes by row and column.
     """
 
     x: Array
     y: Array
     matrix: sparse.csr_array
+    lattice: Lattice
 
 
-def gradient_operator(telescope: Telescope, sensor: SensorLayout) -> GradientOperator:
+def gradient_operator(telescope: Telescope, sensor: SensorLayout, oversampling: int = OVERSAMPLING) -> GradientOperator:
     """The operator of one sensor, where ``sensor`` says that it is.
+
+    Args:
+        oversampling: 1 has nodes at a sub-aperture's corners only, 2 is the 3 x 3 stencil of eq. 28, 4 has 5 x 5 nodes.
 
     Raises:
         ValueError: a sub-aperture is dark, so its slope means nothing.
     """
-    cells = _OVERSAMPLING * max(1, math.ceil(sensor.size / LARGEST_SUBAPERTURE - 1e-9))
+    cells = oversampling * max(1, math.ceil(sensor.size / LARGEST_SUBAPERTURE - 1e-9))
     light, u, v = cell_light(telescope, sensor, cells, _FINE)
     total = light.sum(axis=(1, 2), keepdims=True)
     if not total.all():
@@ -84,5 +91,8 @@ def gradient_operator(telescope: Telescope, sensor: SensorLayout) -> GradientOpe
     matrix.data[np.abs(matrix.data) < 1e-12 * np.abs(matrix.data).max()] = 0
     matrix.eliminate_zeros()
     used = np.unique(matrix.indices)
-    node_y, node_x = (sensor.size * (index / cells - len(sensor.mask) / 2) for index in np.divmod(used, n_grid))
-    return GradientOperator(*sensor.to_pupil(node_x, node_y), matrix[:, used])
+    corner_at = -sensor.size * len(sensor.mask) / 2
+    lattice = Lattice(
+        sensor.size / cells, (corner_at, corner_at), sensor.rotation, sensor.shift, used // n_grid, used % n_grid
+    )
+    return GradientOperator(*lattice.points(), matrix[:, used], lattice)

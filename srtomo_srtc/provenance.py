@@ -10,8 +10,13 @@ from typing import Any
 import numba
 import numpy as np
 import scipy
+from numpy.typing import NDArray
 
+from srtomo_core.layout import Layout
+from srtomo_core.reconstructor import Reconstructor
 from srtomo_core.system import System
+
+Array = NDArray[np.float64]
 
 
 class Stages:
@@ -31,6 +36,11 @@ class Stages:
         self._name, self._since = name, now
         if self._progress is not None:
             self._progress(name, done)
+
+    def within(self, done: float, first: float, last: float) -> None:
+        """A share ``done`` of the stage is behind, whose own shares of the whole are ``first`` to ``last``."""
+        if self._progress is not None:
+            self._progress(self._name, first + (last - first) * done)
 
 
 def provenance(system: System, method: str, gain: float, seconds: dict[str, float], **details: Any) -> dict[str, Any]:
@@ -72,3 +82,24 @@ def provenance(system: System, method: str, gain: float, seconds: dict[str, floa
         },
         "seconds": seconds,
     }
+
+
+def reconstructor_of(
+    system: System, R: Array, G: Array, *, method: str, label: str, gain: float, stages: Stages, **details: Any
+) -> tuple[Reconstructor, Array]:
+    """A method's last stage: R (n_commands, n_slopes) and G as a reconstructor for the system, and G.
+
+    Other arguments as :func:`provenance` takes them.
+    """
+    stages.enter("done", 1.0)
+    nominal = Layout(system)
+    reconstructor = Reconstructor.from_matrices(
+        R,
+        G,
+        fingerprint=nominal.fingerprint,
+        gain=system.loop.gain,
+        command_limit=nominal.stroke,
+        label=label,
+        provenance=provenance(system, method, gain, stages.seconds, **details),
+    )
+    return reconstructor, G

@@ -4,8 +4,9 @@ Slopes to the pupil's wavefront towards the science targets, without layers in b
 
     R = F Sigma_phi_s P [ P (Sigma_ss + Sigma_nn) P + gamma (I - P) ]^-1 P
 
-P takes the mean x and mean y slope out of every sensor whose star is blind to tip-tilt; natural stars' slopes take
-part in the same estimate. F fits the mirrors to the wavefront in the least-squares sense over targets and pupil.
+P takes tip-tilt and focus out of every sensor whose star is blind to them; natural stars' slopes take part in the same
+estimate, or with ``split`` control tip-tilt alone (:mod:`srtomo_srtc.split`). F fits the mirrors to the wavefront in
+the least-squares sense over targets and pupil.
 """
 
 from __future__ import annotations
@@ -14,17 +15,23 @@ from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve
 
 from srtomo_core.layout import Layout
 from srtomo_core.reconstructor import Reconstructor
 from srtomo_core.system import System
 from srtomo_srtc.atmosphere import Profile
-from srtomo_srtc.covariance import Turbulence, slope_covariance, slope_wavefront_covariance
+from srtomo_srtc.covariance import Turbulence, slope_tiles
+from srtomo_srtc.crossterms import right_hand_side
+from srtomo_srtc.estimator import commands_from, divide
 from srtomo_srtc.fitting import KAPPA, Fit
+from srtomo_srtc.gradient import OVERSAMPLING
+from srtomo_srtc.memory import require
 from srtomo_srtc.mirrors import interaction_matrix
-from srtomo_srtc.model import noise_prior, project, project_both_sides, sightlines, tip_tilt_means
+from srtomo_srtc.model import blind_modes, elongation_prior, noise_prior, sightlines
 from srtomo_srtc.provenance import Stages, provenance
+from srtomo_srtc.solve import SymmetricTiles
+from srtomo_srtc.split import Split
+from srtomo_srtc.wind import sensors_carried, winds
 
 Array = NDArray[np.float64]
 
@@ -36,6 +43,11 @@ def implicit(
     label: str = "",
     noise_gain: float | None = None,
     kappa: float = KAPPA,
+    split: bool = False,
+    lag: float = 0.0,
+    oversampling: int = OVERSAMPLING,
+    fast: bool = False,
+    threads: int = 1,
     progress: Callable[[str, float], None] | None = None,
 ) -> tuple[Reconstructor, Array]:
     """Build the reconstructor and the interaction matrix that it goes with.
@@ -48,13 +60,20 @@ def implicit(
         noise_gain: loop gain g, the system's when not given: in a loop the estimate sees noise through a filter that
             leaves ``g / (2-g)`` of its variance.
         kappa: regularisation of the fit, relative to the mean square of an influence function over the pupil.
+        split: natural stars control tip-tilt alone, lasers everything else.
+        lag: estimate the wavefront so much later than the exposure, every layer gone with its wind, s.
+        oversampling: of the gradients' nodes, 1, 2 or 4 a sub-aperture.
+        fast: float32, and interpolated covariances where that is quicker; the wavefront error stays within 0.1 nm.
+        threads: to compute with, apart from those of the BLAS library.
         progress: called with the name of each stage and the share of the work done before it, 0 to 1.
 
     Returns:
         The reconstructor, and G (n_slopes, n_commands) rad/m.
 
     Raises:
-        ValueError: the layout has other slopes or commands than the system, or a dark sub-aperture.
+        ValueError: the layout has other slopes or commands than the system, or a dark sub-aperture; or there is
+            nothing to split.
+        MemoryError: one line, before any work, if there is not enough.
     """
     nominal = Layout(system)
     layout = nominal if layout is None else layout
@@ -64,30 +83,42 @@ def implicit(
     stages = Stages(progress)
 
     stages.enter("geometry", 0.0)
+    require(bytes_needed(layout, fast), f"implicit reconstructor of {system.name}")
     profile = Profile.of(system)
-    sensors = sightlines(system, layout, profile)
+    sensors = sightlines(system, layout, profile, oversampling)
     fit = Fit(system, layout, kappa)
-    targets = list(fit.footprints(profile.heights))
-    turbulence = Turbulence.covering(profile, [*(s.nodes for s in sensors), *(points for _, points in targets)])
+    later = sensors_carried(sensors, winds(system), lag) if lag else sensors
+    turbulence = Turbulence.covering(
+        profile,
+        [*(s.nodes for s in [*sensors, *later]), *(points for _, points in fit.footprints(profile.heights))],
+    )
+    blind, noise = blind_modes(system, layout), noise_prior(system, layout, gain)
 
     stages.enter("interaction matrix", 0.1)
-    G = interaction_matrix(system, layout)
+    G = interaction_matrix(system, layout, threads)
 
-    stages.enter("slope covariance", 0.15)
-    S = slope_covariance(turbulence, sensors)
-    S[np.diag_indices_from(S)] += noise_prior(system, layout, gain)
-    means = tip_tilt_means(system, layout)
-    project_both_sides(S, means, gamma=S.trace() / len(S))
+    stages.enter("wavefront-slope covariance", 0.15)
+    wanted = right_hand_side(fit, turbulence, later, profile.heights, fast=fast, threads=threads)
 
-    stages.enter("wavefront-slope covariance", 0.4)
-    right = np.zeros((layout.n_slopes, layout.n_commands))
-    for view, points in targets:
-        right += slope_wavefront_covariance(turbulence, sensors, points) @ view.projection.T
+    stages.enter("slope covariance", 0.5)
+    S = slope_tiles(turbulence, sensors, fast=fast, threads=threads)
+    S.add_diagonal(noise)
+    S.add_below_diagonal(*elongation_prior(system, layout, gain))
 
-    stages.enter("solution", 0.8)
-    # S is symmetric: its transpose is the same matrix in the order that LAPACK factors without a copy
-    factor = cho_factor(S.T, overwrite_a=True)
-    R = fit.solve(project(cho_solve(factor, project(right, means)), means).T)
+    stages.enter("solution", 0.6)
+    if split:
+        R = commands_from(
+            S.dense().astype(np.float64),
+            wanted.T.astype(np.float64),
+            blind,
+            fit.solve,
+            Split.of(system, layout, G),
+            noise,
+        )
+    else:
+        divide(wanted, S, blind, threads, lambda done: stages.within(done, 0.6, 1.0))
+        del S
+        R = fit.solve(wanted)
 
     stages.enter("done", 1.0)
     reconstructor = Reconstructor.from_matrices(
@@ -97,6 +128,26 @@ def implicit(
         gain=system.loop.gain,
         command_limit=nominal.stroke,
         label=label,
-        provenance=provenance(system, "implicit", gain, stages.seconds, kappa=kappa),
+        provenance=provenance(
+            system,
+            "predictive" if lag else "implicit",
+            gain,
+            stages.seconds,
+            kappa=kappa,
+            split=split,
+            lag_s=lag,
+            oversampling=oversampling,
+            fast=fast,
+        ),
     )
     return reconstructor, G
+
+
+def bytes_needed(layout: Layout, fast: bool) -> float:
+    """Memory of :func:`implicit` at its peak, about."""
+    dtype = np.dtype(np.float32 if fast else np.float64)
+    matrix = layout.n_slopes * layout.n_commands
+    solving = SymmetricTiles.bytes_needed(layout.n_slopes, dtype) + matrix * dtype.itemsize
+    # R and its rounded self in float64, while Q is formed
+    ending = 2 * matrix * 8 + matrix * 4
+    return matrix * 8 + 3 * 8 * layout.n_commands**2 + max(solving, ending)

@@ -36,6 +36,29 @@ def test_a_lit_subaperture_has_the_paper_s_stencil(mini: System) -> None:
         assert operator.matrix[[row]].nnz == 6
 
 
+@pytest.mark.parametrize("oversampling", [1, 2, 4])
+def test_a_lit_subaperture_at_any_oversampling(mini: System, oversampling: int) -> None:
+    # the mean gradient over a square of a bilinear phase: differences of opposite sides, by the trapezoidal rule
+    place = Layout(mini).sensors[0]
+    operator = gradient_operator(Telescope(diameter=100.0, obscuration=0.0), place, oversampling)
+    x, y = _local(place, operator)
+    i = int(np.argmin(np.hypot(*place.local.T)))
+    side = np.ones(oversampling + 1)
+    side[[0, -1]] = 0.5
+    side /= side.sum() * place.size
+    row = operator.matrix[[i]]
+    for column, weight in zip(row.nonzero()[1], row.data):
+        along_y = round(oversampling * ((y[column] - place.local[i, 1]) / place.size + 0.5))
+        along_x = (x[column] - place.local[i, 0]) / place.size
+        assert along_x == pytest.approx(0.5 * np.sign(weight))
+        assert abs(weight) == pytest.approx(side[along_y])
+    assert row.nnz == 2 * len(side)
+    # the lattice is the same nodes
+    np.testing.assert_allclose(np.stack(operator.lattice.points()), [operator.x, operator.y], atol=1e-12)
+    rows = operator.lattice.to_steps(operator.x, operator.y)
+    np.testing.assert_allclose(rows, np.stack([operator.lattice.row, operator.lattice.column], axis=1), atol=1e-9)
+
+
 @pytest.mark.parametrize("centre", [(0.0, 0.0), (0.35, -0.2), (-0.61, 0.43), (0.9, 0.8)])
 @pytest.mark.parametrize("threshold", [0.02, 0.5])
 def test_ramps_and_piston_under_any_illumination(mini: System, centre: tuple[float, float], threshold: float) -> None:
@@ -44,6 +67,7 @@ def test_ramps_and_piston_under_any_illumination(mini: System, centre: tuple[flo
             "telescope.obscuration_centre": centre,
             "sensors.*.illumination_threshold": threshold,
             "sensors.3.rotation": 0.3,
+            "telescope.spiders": [{"width": 0.15, "angle": 0.4}, {"width": 0.15, "angle": 2.0}],
         }
     )
     for place in Layout(system).sensors:

@@ -11,6 +11,7 @@ import pytest
 from srtomo_core.layout import Layout
 from srtomo_core.reconstructor import Reconstructor
 from srtomo_core.system import System, load_system
+from srtomo_srtc import memory
 from srtomo_srtc.atmosphere import METRES_PER_RADIAN, Profile
 from srtomo_srtc.covariance import Turbulence, slope_covariance, slope_wavefront_covariance, wavefront_covariance
 from srtomo_srtc.geometry import footprints, pupil_grid
@@ -268,6 +269,18 @@ def test_the_best_prior_is_the_right_one(on_axis: System, prediction: Prediction
     ):
         assert prediction.wfe(_matrix(wrong)) > best + 0.3e-9
     assert prediction.wfe(_matrix(ground_prior(on_axis))) > 1.2 * best
+
+
+def test_fast_costs_next_to_nothing(on_axis: System, prediction: Prediction) -> None:
+    fast, _ = implicit(on_axis, fast=True, threads=2)
+    assert fast.R.tobytes() != implicit(on_axis)[0].R.tobytes()
+    assert prediction.wfe(fast.R[0].astype(float)) - prediction.wfe(_matrix(on_axis)) < 0.05e-9
+
+
+def test_more_memory_than_there_is_is_refused_at_once(mini: System, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(memory, "available", lambda: 1e5)
+    with pytest.raises(MemoryError, match=r"implicit reconstructor of mini: needs 0\.0 GiB of memory"):
+        implicit(mini)
 
 
 def test_ground_prior_moves_everything_down() -> None:
