@@ -8,7 +8,7 @@ import os
 import sys
 from collections.abc import Sequence
 from importlib.metadata import PackageNotFoundError, version
-from typing import NamedTuple
+from typing import NamedTuple, NoReturn
 
 
 class Command(NamedTuple):
@@ -27,7 +27,11 @@ GROUPS: dict[str, tuple[Command, ...]] = {
     "Instruments and reconstructors": (
         Command("systems", "list the instruments, or print one in full with derived quantities"),
         Command("reconstruct", "build a tomographic reconstructor and write R, Q, G"),
+        Command("predict", "residual wavefront error and stability margins from covariances alone"),
+        Command("design", "sensor shifts, clockings, asterism or mirror pitch that leave the least error"),
         Command("calibrate", "measure the interaction matrix of the simulated instrument"),
+        Command("bench", "how fast this machine is, once what it computes is checked"),
+        Command("reproduce", "measure published figures again and say which hold"),
     ),
     "Nodes": (
         Command("hrtc", "run the hard-real-time node: slopes in, commands out", "nodes"),
@@ -47,6 +51,13 @@ GROUPS: dict[str, tuple[Command, ...]] = {
 _LOCAL = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "FASTDDS_BUILTIN_TRANSPORTS": "SHM"}
 
 _THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
+
+
+class _Parser(argparse.ArgumentParser):
+    """Says in one line what is wrong, as every command does."""
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(2, f"{self.prog}: {message} (see '{self.prog} --help')\n")
 
 
 def _overview() -> str:
@@ -89,7 +100,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if not any(variable in os.environ for variable in _LOCAL):
         os.environ.update(_LOCAL)
     module = importlib.import_module(f"srtomo_ops.commands.{command.module or command.name}")
-    parser = argparse.ArgumentParser(
+    from srtomo_ops.options import writable_file
+
+    parser = _Parser(
         prog=f"srtomo {command.name}",
         description=command.help[0].upper() + command.help[1:] + ".",
         formatter_class=argparse.RawDescriptionHelpFormatter,
@@ -99,6 +112,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(words[1:])
     options.command = command.name
     try:
+        if getattr(options, "json", None) is not None:
+            writable_file(options.json)  # before any work
         return int(module.main(options))
     except KeyboardInterrupt:
         return 130
@@ -111,7 +126,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
             f"srtomo {command.name}: needs ROS 2 ({error.name} is missing): pip install 'srtomo[ros]'", file=sys.stderr
         )
         return 2
-    except ValueError as error:
+    except OSError as error:
+        if error.filename is None or os.environ.get("SRTOMO_TRACEBACK"):
+            raise
+        print(f"srtomo {command.name}: {error.filename}: {error.strerror}", file=sys.stderr)
+        return 2
+    except (ValueError, MemoryError) as error:
         # every error of bad input in srtomo is a ValueError of one line
         if "\n" in str(error) or os.environ.get("SRTOMO_TRACEBACK"):
             raise

@@ -32,12 +32,16 @@ class OperatorError(ValueError):
 class Operator(Node):
     """A node that calls the others and remembers their latest status. One thread calls everything.
 
+    Args:
+        patience: s to wait for a service that nobody offers yet.
+
     Attributes:
         hrtc, recorder, sim: the latest status of each, or None.
     """
 
-    def __init__(self, namespace: str = "", name: str = "operator") -> None:
+    def __init__(self, namespace: str = "", name: str = "operator", patience: float = 30.0) -> None:
         super().__init__(name, namespace=namespace)
+        self._patience = patience
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self)
         self.hrtc: HrtcStatus | None = None
@@ -64,11 +68,12 @@ class Operator(Node):
         """
         client = self.create_client(kind, service)
         try:
-            end = time.monotonic() + timeout
+            end = time.monotonic() + self._patience
             while not client.service_is_ready():
                 if time.monotonic() > end:
                     raise OperatorError(f"{service}: nobody offers this service in namespace {self.get_namespace()}")
                 self.spin(0.05)
+            end = time.monotonic() + timeout
             future = client.call_async(request)
             while not future.done():
                 if time.monotonic() > end:
@@ -92,9 +97,12 @@ class Operator(Node):
         Raises:
             OperatorError: it failed; the node's log says why.
         """
-        request = ChangeState.Request(transition=Transition(id=TRANSITIONS[name]))
+        # by the label rclpy finds out whether there is such a transition now; an id alone it would stumble over
+        request = ChangeState.Request(transition=Transition(id=TRANSITIONS[name], label=name))
         if not self.call(ChangeState, "hrtc/change_state", request, timeout=30.0).success:
-            raise OperatorError(f"{name}: the HRTC refused or failed; its log says why")
+            self.spin(0.3)
+            state = f"the HRTC is {self.hrtc.state}" if self.hrtc is not None else "refused"
+            raise OperatorError(f"{name}: {state}; if that allows it, the HRTC's log says why it failed")
 
     def close_loop(self, closed: bool) -> None:
         """Close or open the loop.
@@ -107,8 +115,14 @@ class Operator(Node):
             raise OperatorError(f"hrtc/close_loop: {response.message}")
 
     def start_sim(self) -> None:
-        """Let the simulated plant publish its first frame."""
-        self.call(Trigger, "sim/start", Trigger.Request())
+        """Let the simulated plant publish its first frame.
+
+        Raises:
+            OperatorError: it has done so before.
+        """
+        response = self.call(Trigger, "sim/start", Trigger.Request())
+        if not response.success:
+            raise OperatorError(f"sim/start: {response.message}")
 
     def publish(self, label: str) -> tuple[int, bytes]:
         """Have the SRTC publish a reconstructor by its label: its id and SHA-256.
@@ -125,10 +139,12 @@ class Operator(Node):
         """Wait until the HRTC has a reconstructor staged.
 
         Raises:
-            OperatorError: it has not in time.
+            OperatorError: it has not in time, or runs it already.
         """
         end = time.monotonic() + timeout
         while self.hrtc is None or self.hrtc.staged != identity:
+            if self.hrtc is not None and self.hrtc.reconstructor == identity:
+                raise OperatorError(f"reconstructor {identity:016x} is active already")
             if time.monotonic() > end:
                 raise OperatorError(
                     f"reconstructor {identity:016x} was not staged in {timeout:g} s; the HRTC's log says why"

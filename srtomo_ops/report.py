@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from srtomo_core import wire
 from srtomo_core.bag import BagReader
 from srtomo_core.layout import Layout
 from srtomo_core.system import System
+from srtomo_srtc.design import Cut, Design
 
 
 def demo_figure(
@@ -56,6 +58,28 @@ def demo_figure(
     image = right.imshow(shape, origin="lower", cmap="RdBu_r")
     right.set(title=f"{mirror.name} at the end [nm of wavefront]", xticks=[], yticks=[])
     figure.colorbar(image, ax=right, shrink=0.8)
+    figure.tight_layout()
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
+def design_figure(path: Path, title: str, found: Design, lines: Sequence[Cut], amounts: Any, cost: Any) -> None:
+    """How flat a design's optimum is along each variable, and what unknown shifts of its sensors cost.
+
+    Args:
+        amounts, cost: (n,) sub-apertures, and m rms.
+    """
+    figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4.2))
+    for cut, value in zip(lines, found.values, strict=True):
+        span = cut.variable.high - cut.variable.low
+        left.plot((cut.values - value) / span, cut.wfe * 1e9, marker=".", lw=1, label=cut.variable.name)
+    left.axhline(found.start_wfe * 1e9, color="black", ls="--", lw=1, label="as it was")
+    left.set(xlabel="distance from the optimum [share of the range]", ylabel="WFE [nm rms], tip-tilt removed",
+             title=title)  # fmt: skip
+    left.legend(fontsize=7)
+    right.plot(amounts, np.asarray(cost) * 1e9, marker="o")
+    right.set(xlabel="sensors off by, unknown [sub-aperture]", ylabel="WFE [nm rms], tip-tilt removed",
+              title="misalignment")  # fmt: skip
     figure.tight_layout()
     figure.savefig(path, dpi=110)
     plt.close(figure)

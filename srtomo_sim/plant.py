@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from srtomo_core.system import System
 from srtomo_sim.mirror import DelayLine, OnMirror
-from srtomo_sim.shack_hartmann import noise_sigma
+from srtomo_sim.shack_hartmann import noise_correlation, noise_sigma
 from srtomo_sim.sky import Sky, WavefrontError
 
 _NOISE = 0x6E6F697365  # keeps the noise of a seed apart from its screens
@@ -41,6 +41,11 @@ class Plant:
         self._sky = sky
         self._key = np.array([sky.seed if seed is None else seed, _NOISE], np.uint64)
         self._sigma = noise_sigma(system, sky.layout).astype(np.float32)
+        self._correlated = [
+            (sky.layout.slopes_of(i), correlation.astype(np.float32))
+            for i, correlation in enumerate(noise_correlation(system, sky.layout))
+            if correlation.any()
+        ]
         self._jitter = np.array([star.jitter for star in system.guide_stars], np.float32)
         self._star = [system.guide_stars.index(system.star_of(sensor)) for sensor in system.sensors]
         self._line = DelayLine(system.loop.delay, sky.layout.n_commands)
@@ -68,6 +73,9 @@ class Plant:
         draw = np.random.Generator(np.random.Philox(key=self._key, counter=[0, frame, 0, 0]))
         tilts = draw.standard_normal((len(self._jitter), 2), np.float32) * self._jitter[:, None]
         slopes = draw.standard_normal(self._sky.layout.n_slopes, np.float32)
+        for own, correlation in self._correlated:
+            x, y = np.split(slopes[own], 2)
+            y[:] = correlation * x + np.sqrt(1 - correlation**2) * y
         slopes *= self._sigma
         slopes += self._sky.slopes[frame]
         slopes -= self._sky.interaction @ self._line.shape(frame)

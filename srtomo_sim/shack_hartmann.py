@@ -124,19 +124,43 @@ def atmospheric_slopes(
 def noise_sigma(system: System, layout: Layout) -> Array:
     """Standard deviation of each slope's measurement noise: (n_slopes,) rad.
 
-    Centre of gravity of N electrons over ``pixels`` x ``pixels``: the spot's rms width times the excess noise over
-    sqrt(N), and read noise summed over the pixels' squared distances, over N.
+    Centre of gravity of N electrons over ``pixels`` x ``pixels``: the spot's rms width along the slope times the excess
+    noise over sqrt(N), and read noise summed over the pixels' squared distances, over N.
     """
-    sigma = [
-        np.tile(_subaperture_noise(sensor, sensor_layout, system.loop.rate), 2)
+    return np.sqrt(np.concatenate([noise[[0, 1], [0, 1]].ravel() for noise in _noise(system, layout)]))
+
+
+def noise_correlation(system: System, layout: Layout) -> list[Array]:
+    """Correlation of each sub-aperture's noise in x with that in y, sensor by sensor: (n_valid,), 0 for round spots."""
+    return [noise[0, 1] / np.sqrt(noise[0, 0] * noise[1, 1]) for noise in _noise(system, layout)]
+
+
+def _noise(system: System, layout: Layout) -> list[Array]:
+    """(2, 2, n_valid) noise covariance of x and y along each sensor's own axes, rad^2."""
+    return [
+        _subaperture_noise(system, sensor, sensor_layout)
         for sensor, sensor_layout in zip(system.sensors, layout.sensors, strict=True)
     ]
-    return np.concatenate(sigma)
 
 
-def _subaperture_noise(sensor: Sensor, layout: SensorLayout, rate: float) -> Array:
-    electrons = sensor.photons * layout.size**2 * layout.illumination / rate
-    width = sensor.spot_fwhm / math.sqrt(8 * math.log(2))
+def _subaperture_noise(system: System, sensor: Sensor, layout: SensorLayout) -> Array:
+    electrons = sensor.photons * layout.size**2 * layout.illumination / system.loop.rate
     pixel = (np.arange(sensor.pixels) - (sensor.pixels - 1) / 2) * sensor.pixel_scale
-    read = sensor.read_noise**2 * sensor.pixels * (pixel**2).sum()
-    return np.sqrt((width * sensor.excess_noise) ** 2 / electrons + read / electrons**2)
+    read = sensor.read_noise**2 * sensor.pixels * (pixel**2).sum() / electrons**2
+    return sensor.excess_noise**2 * _spot_covariance(system, sensor, layout) / electrons + read * np.eye(2)[:, :, None]
+
+
+def _spot_covariance(system: System, sensor: Sensor, layout: SensorLayout) -> Array:
+    """(2, 2, n_valid) second moments of each sub-aperture's spot, rad^2: an ellipse along the line from the launch."""
+    across = np.full(layout.n_valid, sensor.spot_fwhm / math.sqrt(8 * math.log(2)))
+    star = system.star_of(sensor)
+    if star.launch is None or star.sodium_thickness is None:
+        return np.eye(2)[:, :, None] * across**2
+    from_launch = np.stack(layout.to_pupil(*layout.local.T), axis=1) - star.launch
+    # seen from the pupil, both ends of a column along the beam lie in the direction of the launch, so far apart:
+    thickness = star.sodium_thickness / math.cos(system.zenith_angle)
+    length = thickness * np.hypot(*from_launch.T) / system.los_range(star) ** 2
+    along = np.hypot(across, length / math.sqrt(8 * math.log(2)))
+    angle = np.arctan2(from_launch[:, 1], from_launch[:, 0]) - layout.rotation
+    axes = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    return np.einsum("ikn,kn,jkn->ijn", axes, np.stack([along, across]) ** 2, axes)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import math
+import time
 from typing import TYPE_CHECKING
 
 from srtomo_ops.options import add_json, write_json
@@ -17,6 +19,8 @@ EXAMPLE = """examples:
   srtomo ctl commit 0123456789abcdef 0123...   id and SHA-256, in hex, as 'srtomo ctl publish' printed them
   srtomo ctl close                          close the loop
   srtomo ctl status"""
+
+_PATIENCE = 5.0  # s to find a node: discovery takes up to 1.3 s, more on a busy machine
 
 _ACTIONS = (
     "status", "configure", "activate", "deactivate", "cleanup", "close", "open", "start-sim", "publish", "commit",
@@ -38,11 +42,15 @@ def main(options: argparse.Namespace) -> int:
 
     from srtomo_ops.operator import TRANSITIONS, Operator
 
-    expected = {"publish": 1, "commit": 2, "roll-back": 2}.get(options.action, 0)
-    if len(options.words) != expected:
-        raise ValueError(f"{options.action}: expected {expected} words after it, got {len(options.words)}")
+    expected = {"publish": "LABEL", "commit": "ID SHA256", "roll-back": "ID SHA256"}.get(options.action, "")
+    if len(options.words) != len(expected.split()):
+        raise ValueError(
+            f"{options.action}: expected {expected or 'nothing'} after it, got {' '.join(options.words) or 'nothing'}"
+        )
+    if options.action in ("commit", "roll-back"):
+        identity, sha256 = _identity(*options.words)
     rclpy.init()
-    operator = Operator(options.namespace, "ctl")
+    operator = Operator(options.namespace, "ctl", patience=_PATIENCE)
     numbers: dict[str, object] = {}
     try:
         if options.action in TRANSITIONS:
@@ -56,7 +64,6 @@ def main(options: argparse.Namespace) -> int:
             operator.wait_staged(identity)
             numbers = {"id": f"{identity:016x}", "sha256": sha256.hex()}
         elif options.action in ("commit", "roll-back"):
-            identity, sha256 = int(options.words[0], 16), bytes.fromhex(options.words[1])
             numbers = {"first_frame": operator.commit(identity, sha256, roll_back=options.action == "roll-back")}
         else:
             numbers = _status(operator)
@@ -64,19 +71,36 @@ def main(options: argparse.Namespace) -> int:
         operator.destroy_node()
         rclpy.shutdown()
     for name, value in numbers.items():
-        print(f"{name:<22} {value}")
+        print(f"{name:<22} {'' if value is None else value}")
     if not numbers:
         print("done")
     write_json(options.json, numbers)
     return 0
 
 
+def _identity(id_word: str, sha256_word: str) -> tuple[int, bytes]:
+    try:
+        identity, sha256 = int(id_word, 16), bytes.fromhex(sha256_word)
+    except ValueError:
+        identity, sha256 = 0, b""
+    if len(sha256) != 32:
+        raise ValueError(
+            f"expected ID and SHA256 in hex, as 'srtomo ctl publish' prints them, got {id_word} {sha256_word}"
+        )
+    return identity, sha256
+
+
 def _status(operator: Operator) -> dict[str, object]:
-    operator.spin(1.5)
-    if operator.hrtc is None:
-        raise ValueError(f"no HRTC in namespace {operator.get_namespace()}")
-    return {
-        name: getattr(operator.hrtc, name)
-        for name in operator.hrtc.get_fields_and_field_types()
-        if name not in ("header",)
-    }
+    from msgs_schema.msg import HrtcEvent
+
+    end = time.monotonic() + _PATIENCE
+    while (status := operator.hrtc) is None:
+        if time.monotonic() > end:
+            raise ValueError(f"no HRTC in namespace {operator.get_namespace()}")
+        operator.spin(0.05)
+    numbers = {name: getattr(status, name) for name in status.get_fields_and_field_types() if name != "header"}
+    for name in ("reconstructor", "staged", "previous"):
+        numbers[name] = f"{numbers[name]:016x}" if numbers[name] else "none"
+    numbers["loop_state"] = "closed" if status.loop_state == HrtcEvent.CLOSED else "open"
+    numbers["silence"] = status.silence if math.isfinite(status.silence) else None
+    return numbers

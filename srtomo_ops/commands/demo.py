@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import sys
 import time
 from pathlib import Path
 
@@ -39,7 +40,8 @@ def main(options: argparse.Namespace) -> int:
 
     from srtomo_ops.demo import Demo, summary
 
-    console = Console()
+    # in a file nothing is to be wrapped at 80 columns, paths least of all
+    console = Console(width=None if sys.stdout.isatty() else 160)
     with domain_id() as domain:
         # a domain of its own: two demos on one machine must not mix
         os.environ["ROS_DOMAIN_ID"] = str(domain)

@@ -48,4 +48,9 @@ def main(options: argparse.Namespace) -> int:
         for name, default, description in module.parameters():
             print(f"{name:<20} {default!r:<10} {description}")
         return 0
+    known = [name for name, _, _ in module.parameters()]
+    for parameter in options.p:
+        # ROS takes parameters that no node declares, without a word
+        if (name := parameter.partition(":=")[0]) not in known:
+            raise ValueError(f"-p {parameter}: no such parameter (expected one of {', '.join(known)})")
     return int(module.main(arguments))

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from srtomo_core.layout import Layout
 from srtomo_core.reconstructor import Reconstructor
 from srtomo_ops.options import add_json, add_system, system_of, write_json
 from srtomo_ops.progress import Progress
@@ -44,10 +45,10 @@ def main(options: argparse.Namespace) -> int:
         believed = ground_prior(system) if options.prior == "ground" else system
         with Progress("reconstructor") as progress:
             reconstructor, _ = implicit(believed, label=options.prior, progress=progress.stage)
+    if reconstructor.fingerprint != Layout(system).fingerprint:
+        raise ValueError(f"{options.reconstructor}: made for another instrument than {system.name}")
     with Progress("sky") as progress:
         sky = prepare(system, options.frames, options.seed, progress=progress.share)
-    if reconstructor.fingerprint != sky.layout.fingerprint:
-        raise ValueError(f"{options.reconstructor}: made for another instrument than {system.name}")
     program = program_of(sky.layout, reconstructor, plain_settings(sky.layout, system.loop.leak))
     with Progress("loop") as progress:
         result = run(

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from srtomo_core.layout import Layout
+from srtomo_core.layout import Array, Layout
 from srtomo_core.reconstructor import Reconstructor
 from srtomo_core.system import System
 from srtomo_ops.simulate import SETTLING, program_of, run
@@ -23,8 +23,8 @@ from srtomo_srtc.reconstructors.implicit import implicit
 SCIENCE_EVERY = 5
 """Frames between two looks at the wavefront error: sub-apertures cross a layer's speckle in some tens."""
 
-# rough seconds on one core of 2020: shares of the progress
-_SKY, _BUILD, _RUN = 16.0, 5.0, 3.0
+# seconds of each on one core, roughly: shares of the progress
+_SKY, _BUILD, _RUN = 8.0, 2.0, 1.0
 
 
 @dataclass(frozen=True)
@@ -58,9 +58,25 @@ class Outcome(NamedTuple):
         fitting: (n_seeds,) m rms of what the mirrors cannot make.
     """
 
-    wfe: np.ndarray
-    strehl: np.ndarray
-    fitting: np.ndarray
+    wfe: Array
+    strehl: Array
+    fitting: Array
+
+    @property
+    def rms(self) -> float:
+        """Mean of ``wfe`` over the seeds, m."""
+        return float(np.mean(self.wfe))
+
+
+def quadrature(worse: Outcome, better: Outcome) -> float:
+    """Mean over paired seeds of ``sqrt(worse^2 - better^2)``, m; negative where ``better`` is worse."""
+    squares = worse.wfe**2 - better.wfe**2
+    return float(np.mean(np.sign(squares) * np.sqrt(np.abs(squares))))
+
+
+def direct(worse: Outcome, better: Outcome) -> float:
+    """Mean over paired seeds of ``worse - better``, m."""
+    return float(np.mean(worse.wfe - better.wfe))
 
 
 def with_electrons(system: System, electrons: float, subaperture: float = 0.4) -> System:

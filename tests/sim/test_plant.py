@@ -6,7 +6,7 @@ import pytest
 from srtomo_core.system import System
 from srtomo_sim.mirror import OnMirror
 from srtomo_sim.plant import Plant
-from srtomo_sim.shack_hartmann import noise_sigma
+from srtomo_sim.shack_hartmann import noise_correlation, noise_sigma
 from srtomo_sim.sky import Sky, prepare
 
 
@@ -115,3 +115,17 @@ def test_refuses_another_sky(mini: System, sky: Sky) -> None:
             Plant(mini.with_changes(changes), sky)
     with pytest.raises(IndexError, match="prepared for 400 frames"):
         Plant(mini, sky).measure(400)
+
+
+def test_noise_of_elongated_spots_is_correlated(mini: System, sky: Sky) -> None:
+    still = mini.with_changes(
+        {"guide_stars.*.jitter": 0.0, "guide_stars.0.launch": (5.0, 0.0), "guide_stars.0.sodium_thickness": 60e3}
+    )
+    noise = np.array([Plant(still, sky).measure(k) - sky.slopes[k] for k in range(400)])
+    sigma, rho = noise_sigma(still, sky.layout), noise_correlation(still, sky.layout)[0]
+    n = sky.layout.sensors[0].n_valid
+    assert noise.std(axis=0) == pytest.approx(sigma, rel=0.2)
+    x, y = noise[:, :n] / sigma[:n], noise[:, n : 2 * n] / sigma[n : 2 * n]
+    assert abs(rho).max() > 0.5
+    assert (x * y).mean(axis=0) == pytest.approx(rho, abs=0.25)
+    assert np.mean((x * y).mean(axis=0) * np.sign(rho)) == pytest.approx(np.mean(abs(rho)), abs=0.02)

@@ -9,7 +9,7 @@ import pytest
 from srtomo_core.layout import Layout, transmission
 from srtomo_core.system import System
 from srtomo_core.units import ARCSEC
-from srtomo_sim.shack_hartmann import atmospheric_slopes, cut, lit_fractions, noise_sigma
+from srtomo_sim.shack_hartmann import atmospheric_slopes, cut, lit_fractions, noise_correlation, noise_sigma
 from srtomo_sim.turbulence import Screens
 
 
@@ -105,3 +105,26 @@ def test_noise(mini: System) -> None:
     assert sigma[full + layout.sensors[0].n_valid] == sigma[full]
     part = np.argmin(layout.sensors[0].illumination)
     assert sigma[part] > sigma[full] / math.sqrt(layout.sensors[0].illumination[part]) * 0.999
+
+
+def test_noise_of_elongated_spots_along_and_across(mini: System) -> None:
+    """4 m from the launch: 10 km of sodium at 90 km are 10e3 * 4 / 90e3^2 rad long; nothing changes across."""
+    changes: dict[str, object] = {"zenith_angle": 0.0, "sensors.0.rotation": 0.4, "sensors.0.read_noise": 0.0}
+    system = mini.with_changes({**changes, "guide_stars.0.launch": (4.0, 1.0), "guide_stars.0.sodium_thickness": 10e3})
+    layout = Layout(system)
+    place = layout.sensors[0]
+    n = place.n_valid
+    before = noise_sigma(mini.with_changes(changes), layout)[:n] ** 2
+    sigma, rho = noise_sigma(system, layout)[: 2 * n], noise_correlation(system, layout)
+    x, y = place.to_pupil(*place.local.T)
+    for s in range(0, n, 5):
+        xy = rho[0][s] * sigma[s] * sigma[n + s]
+        covariance = np.array([[sigma[s] ** 2, xy], [xy, sigma[n + s] ** 2]])
+        line = np.array([x[s] - 4.0, y[s] - 1.0]) @ np.array([[np.cos(0.4), -np.sin(0.4)], [np.sin(0.4), np.cos(0.4)]])
+        length = 10e3 * np.hypot(*line) / 90e3**2
+        along, across = line / np.hypot(*line), np.array([-line[1], line[0]]) / np.hypot(*line)
+        assert across @ covariance @ across == pytest.approx(before[s], rel=1e-9)
+        ratio = 1 + (length / (1.5 * ARCSEC)) ** 2
+        assert along @ covariance @ along == pytest.approx(before[s] * ratio, rel=1e-9)
+        assert along @ covariance @ across == pytest.approx(0, abs=1e-12 * before[s])
+    assert not any(one.any() for one in rho[1:])
