@@ -20,7 +20,7 @@ EXAMPLE = """examples:
   srtomo ctl close                          close the loop
   srtomo ctl status"""
 
-_PATIENCE = 5.0  # s to find a node: discovery takes up to 1.3 s, more on a busy machine
+_PATIENCE = 10.0  # s to find a node: one that was just started takes some seconds
 
 _ACTIONS = (
     "status", "configure", "activate", "deactivate", "cleanup", "close", "open", "start-sim", "publish", "commit",
