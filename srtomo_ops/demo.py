@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import rclpy
+from rclpy.signals import SignalHandlerOptions
 from rich.console import Console, Group
 from rich.live import Live
 from rich.table import Table
@@ -117,7 +118,8 @@ class Demo:
         Raises:
             NodeError, OperatorError: a node ended, refused or did not answer.
         """
-        rclpy.init()
+        # rclpy's own handlers end the context under the call that Ctrl-C interrupts
+        rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
         operator = Operator(name="demo")
         try:
             with Processes(self._folder) as nodes, self._live() as live:
@@ -177,7 +179,13 @@ class Demo:
         # sky and reconstructors first: they take all there is of the machine
         self._until_service("srtc/publish", "srtc")
         self._until_service("sim/start", "sim")
-        start("hrtc", f"interaction_matrix:={matrix}", f"fifo_priority:={_PRIORITY}")
+        start(
+            "hrtc",
+            f"interaction_matrix:={matrix}",
+            f"fifo_priority:={_PRIORITY}",
+            # a machine shared with others may stall for a while: that should be seen in the figures, not open the loop
+            f"fault_budget:={round(self._system.loop.rate)}",
+        )
         sets = [word for key, value in self._changes.items() for word in ("--set", f"{key}={json.dumps(value)}")]
         nodes.start(
             "recorder",

@@ -76,6 +76,20 @@ class HotEndpoints:
             self._publisher.get_subscription_count(),
         )
 
+    def unmatched(self) -> str:
+        """Who is on our topics but not matched to us, whose quality of service is then not compatible; empty: nobody.
+
+        Not the loop's thread.
+        """
+        publishers, readers = self.matched()
+        slopes, command = self._subscription.topic_name, self._publisher.topic_name
+        strangers = []
+        if (known := self._node.count_publishers(slopes)) > publishers:
+            strangers.append(f"{known - publishers} publishers of {slopes}")
+        if (known := self._node.count_subscribers(command)) > readers:
+            strangers.append(f"{known - readers} readers of {command}")
+        return " and ".join(strangers) + " do not match: incompatible quality of service" if strangers else ""
+
     def destroy(self) -> None:
         """Give the endpoints back; the loop's thread has left by then."""
         self._node.destroy_subscription(self._subscription)

@@ -144,6 +144,7 @@ class HrtcNode(LifecycleNode):
         self._stop = threading.Event()
         self._lifecycle = "unconfigured"
         self.failure: str | None = None
+        self.died = False  # the loop's thread ended by an exception
 
     # -- lifecycle --------------------------------------------------------------------------------------------------
 
@@ -308,6 +309,7 @@ class HrtcNode(LifecycleNode):
                 if hrtc.session and (hrtc.loop.closed or hrtc.loop.state.any()):
                     hrtc.flatten()
         except Exception:
+            self.died = True
             self.failure = "the loop's thread died: " + traceback.format_exc()
             self.get_logger().fatal(self.failure)
             self._stop.set()
@@ -639,6 +641,9 @@ class HrtcNode(LifecycleNode):
         silence = (time.monotonic_ns() - hrtc.last_slopes_ns) * 1e-9
         if hrtc.loop.opened_by_faults:
             return DiagnosticStatus.ERROR, f"the loop opened by itself {hrtc.loop.opened_by_faults} times"
+        unmatched = self._hot.unmatched() if self._hot is not None else ""
+        if unmatched:
+            return DiagnosticStatus.WARN, unmatched
         if not hrtc.session:
             return DiagnosticStatus.OK, "waiting for slopes"
         if silence > _SILENT:
@@ -663,7 +668,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     try:
-        while not stop.is_set():
+        while not stop.is_set() and not node.died:
             try:
                 executor.spin_once(timeout_sec=0.1)
             except Exception:
@@ -671,11 +676,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 node.get_logger().error(f"a call failed:\n{traceback.format_exc()}")
     finally:
         executor.remove_node(node)
-        failed = node.failure is not None and "thread died" in node.failure
         node.close()
         executor.shutdown()
         rclpy.shutdown()
-    return 1 if failed else 0
+    return 1 if node.died else 0
 
 
 if __name__ == "__main__":
