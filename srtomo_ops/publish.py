@@ -8,6 +8,7 @@ import rclpy
 from msgs_schema.msg import SlopeFrame
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
+from rclpy.signals import SignalHandlerOptions
 
 from srtomo_core import wire
 from srtomo_core.bag import BagReader
@@ -22,7 +23,8 @@ def publish_slopes(reader: BagReader, namespace: str = "", start: int = 0) -> in
         ValueError: nobody listens.
     """
     topic = reader.topic(wire.SLOPES.name)
-    rclpy.init()
+    # rclpy's own handlers end the context under the call that Ctrl-C interrupts
+    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     node = Node("replay", namespace=namespace)
     try:
         publisher = node.create_publisher(SlopeFrame, wire.SLOPES.name, QoSProfile(**wire.SLOPES.qos(4096)))

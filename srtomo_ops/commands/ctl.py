@@ -39,6 +39,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def main(options: argparse.Namespace) -> int:
     """Run the command."""
     import rclpy
+    from rclpy.signals import SignalHandlerOptions
 
     from srtomo_ops.operator import TRANSITIONS, Operator
 
@@ -49,7 +50,8 @@ def main(options: argparse.Namespace) -> int:
         )
     if options.action in ("commit", "roll-back"):
         identity, sha256 = _identity(*options.words)
-    rclpy.init()
+    # rclpy's own handlers end the context under the call that Ctrl-C interrupts
+    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     operator = Operator(options.namespace, "ctl", patience=_PATIENCE)
     numbers: dict[str, object] = {}
     try:
