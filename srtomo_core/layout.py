@@ -7,12 +7,14 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
+from srtomo_core.influence import InfluenceFunctions, read_influence
 from srtomo_core.system import Mirror, Sensor, System, Telescope
 
 Array = NDArray[np.float64]
@@ -121,10 +123,12 @@ class MirrorLayout:
     Attributes:
         altitude: of the conjugate along the line of sight, m.
         pitch: at the conjugate, m.
-        coupling: of the influence function at the next actuator.
+        coupling: of the influence function at the next actuator, where it is Gaussian.
         stroke: limit of a command, m of wavefront.
-        mask: (n, n) bool, ``[y, x]``.
+        mask: (n, n) bool, ``[y, x]``. On a hexagonal grid (n_rows, n), every second row half a pitch to the right.
         actuators: (n_actuators, 2) x, y at the conjugate, m, in C order of the mask.
+        functions: influence functions that are not Gaussian.
+        rotation: of the mirror with its functions, already in ``actuators``; rad, counter-clockwise.
     """
 
     name: str
@@ -134,6 +138,8 @@ class MirrorLayout:
     stroke: float
     mask: NDArray[np.bool_]
     actuators: Array
+    functions: InfluenceFunctions | None = None
+    rotation: float = 0.0
 
     @property
     def n_actuators(self) -> int:
@@ -149,9 +155,10 @@ def _mirror_layout(system: System, mirror: Mirror) -> MirrorLayout:
         for d in [s.position for s in system.guide_stars] + [t.position for t in system.science.targets]
     )
     reach = system.telescope.diameter / 2 + altitude * field + mirror.margin * pitch
-    centres = (np.arange(mirror.actuators) - (mirror.actuators - 1) / 2) * pitch
-    grid_y, grid_x = np.meshgrid(centres, centres, indexing="ij")
+    grid_x, grid_y = _grid(mirror.actuators, mirror.grid)
+    grid_x, grid_y = grid_x * pitch, grid_y * pitch
     mask = np.hypot(grid_x, grid_y) <= reach + 1e-9
+    n_actuators = int(np.count_nonzero(mask))
     return MirrorLayout(
         mirror.name,
         altitude,
@@ -160,7 +167,23 @@ def _mirror_layout(system: System, mirror: Mirror) -> MirrorLayout:
         mirror.stroke,
         mask,
         np.stack([grid_x[mask], grid_y[mask]], axis=1),
+        None if mirror.influence is None else read_influence(mirror.influence, n_actuators),
     )
+
+
+def _grid(across: int, kind: str) -> tuple[Array, Array]:
+    """x, y (n_rows, across) of a grid about its centre, in pitches; infinite where there is none."""
+    centres = np.arange(across) - (across - 1) / 2
+    if kind == "square":
+        grid_y, grid_x = np.meshgrid(centres, centres, indexing="ij")
+        return grid_x, grid_y
+    above = math.floor((across - 1) / math.sqrt(3))
+    rows = np.arange(-above, above + 1)
+    grid_y, grid_x = np.meshgrid(rows * math.sqrt(3) / 2, centres, indexing="ij")
+    beside = rows % 2 == 1
+    grid_x[beside] += 0.5
+    grid_x[beside, -1] = np.inf
+    return grid_x, grid_y
 
 
 class Layout:
@@ -231,11 +254,14 @@ class Layout:
             ],
             "mirrors": [
                 {
-                    "place": [m.altitude, m.pitch, m.coupling],
-                    "shape": list(m.mask.shape),
-                    "valid": np.flatnonzero(m.mask).tolist(),
+                    "place": [layout.altitude, layout.pitch, layout.coupling],
+                    "shape": list(layout.mask.shape),
+                    "valid": np.flatnonzero(layout.mask).tolist(),
                 }
-                for m in self.mirrors
+                # absent where they are as they always were: what is on disk keeps its fingerprint
+                | ({} if mirror.grid == "square" else {"grid": mirror.grid})
+                | ({} if layout.functions is None else {"functions": layout.functions.digest})
+                for mirror, layout in zip(system.mirrors, self.mirrors, strict=True)
             ],
         }
         text = json.dumps(content, sort_keys=True, separators=(",", ":"))

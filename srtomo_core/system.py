@@ -14,11 +14,19 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, model_validator
 
 from srtomo_core.units import ARCSEC, Angle, Charge, Delay, Flux, Frequency, Length, Shift, Speed
 
 Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$")]
+
+
+def _beside_the_instrument(path: str, info: ValidationInfo) -> str:
+    return str(Path((info.context or {}).get("folder", "")).absolute() / path)
+
+
+DataFile = Annotated[str, Field(min_length=1), AfterValidator(_beside_the_instrument)]
+"""Path of a file, absolute once read; in an instrument file, from the folder that this is in."""
 
 
 class InstrumentError(ValueError):
@@ -142,6 +150,8 @@ class Sensor(_Frozen):
 
     Its lenslets are rotated about the pupil's centre, then moved by +shift (paper, eq. 33-34). ``photons`` are detected
     electrons per area of pupil and time; ``excess_noise`` multiplies the photon noise's standard deviation.
+    ``noise_covariance`` is a file with what was measured, for estimators to suppose in place of all that: ``.npz`` with
+    ``covariance`` (n_slopes, n_slopes), rad^2, of one frame.
     """
 
     name: Name
@@ -156,21 +166,25 @@ class Sensor(_Frozen):
     read_noise: Annotated[Charge, Field(ge=0)]
     pixels: Annotated[int, Field(ge=2, description="across a sub-aperture")]
     pixel_scale: Annotated[Angle, Field(gt=0)]
+    noise_covariance: DataFile | None = None
 
 
 class Mirror(_Frozen):
-    """A deformable mirror of Gaussian influence functions on a square grid.
+    """A deformable mirror on a square grid, or a hexagonal one: equilateral triangles with one side along x, as M4's.
 
     ``pitch`` is at the mirror's conjugate and defaults to pupil diameter / (actuators - 1). Actuators farther than
-    ``margin`` pitches outside the (meta)pupil do not exist. ``coupling`` is an influence function's value at the next
-    actuator; ``stroke`` limits each command, wavefront, both ways.
+    ``margin`` pitches outside the (meta)pupil do not exist. ``coupling`` is a Gaussian influence function's value at
+    the next actuator; ``influence`` is a file with others (:mod:`srtomo_core.influence`), in which coupling plays no
+    part. ``stroke`` limits each command, wavefront, both ways.
     """
 
     name: Name
     altitude: Annotated[Length, Field(ge=0)] = 0.0
+    grid: Literal["square", "hexagonal"] = "square"
     actuators: Annotated[int, Field(ge=2, le=512, description="across the grid")]
     pitch: Annotated[Length, Field(gt=0)] | None = None
     coupling: Annotated[float, Field(gt=0, lt=1)]
+    influence: DataFile | None = None
     margin: Annotated[float, Field(ge=0)] = 0.8
     stroke: Annotated[Length, Field(gt=0)] = 10e-6
 
@@ -296,7 +310,7 @@ class System(_Frozen):
         Raises:
             InstrumentError: names the key that does not exist or whose value is refused.
         """
-        return _validated(_changed(self.model_dump(mode="python"), changes), self.name, from_file=False)
+        return _validated(_changed(self.model_dump(mode="python"), changes), self.name, {"from_file": False})
 
 
 def _changed(tree: dict[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
@@ -330,9 +344,9 @@ def _assign(node: Any, path: list[str], value: Any, key: str) -> None:
         node[head] = value
 
 
-def _validated(tree: Any, source: str, *, from_file: bool) -> System:
+def _validated(tree: Any, source: str, context: dict[str, Any]) -> System:
     try:
-        return System.model_validate(tree, context={"from_file": from_file})
+        return System.model_validate(tree, context=context)
     except ValidationError as error:
         raise InstrumentError(f"{source}: {_first_problem(error)}") from None
 
@@ -388,13 +402,14 @@ def load_system(name: str | Path, changes: Mapping[str, Any] | None = None) -> S
     if text_name.endswith((".yaml", ".yml")):
         try:
             text, source = Path(name).read_text(encoding="utf-8"), Path(name).name
+            folder = Path(name).resolve().parent
         except OSError as error:
             raise InstrumentError(f"{text_name}: {error.strerror or error}") from None
         except UnicodeDecodeError:
             raise InstrumentError(f"{text_name}: not a text file") from None
     elif text_name in system_names():
         text = (resources.files("srtomo_core") / "systems" / f"{text_name}.yaml").read_text(encoding="utf-8")
-        source = f"{text_name}.yaml"
+        source, folder = f"{text_name}.yaml", Path()
     else:
         raise InstrumentError(f"{text_name}: expected the path of a .yaml file or one of {', '.join(system_names())}")
     try:
@@ -405,7 +420,7 @@ def load_system(name: str | Path, changes: Mapping[str, Any] | None = None) -> S
         raise InstrumentError(f"{source}:{where} not valid YAML ({getattr(error, 'problem', error)})") from None
     if not isinstance(tree, dict):
         raise InstrumentError(f"{source}: expected keys such as telescope, sensors and mirrors")
-    system = _validated(tree, source, from_file=True)
+    system = _validated(tree, source, {"from_file": True, "folder": folder})
     return system.with_changes(changes) if changes else system
 
 

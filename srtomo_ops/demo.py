@@ -214,7 +214,7 @@ class Demo:
         what = "preparing the sky" if node == "sim" else f"building reconstructors '{BEFORE}' and '{AFTER}'"
         self._until(
             client.service_is_ready,
-            lambda: f"{what} ({self._nodes.last_line(node)[-60:]})",
+            lambda: ": ".join(filter(None, (what, self._nodes.last_line(node).rpartition("]: ")[2][-60:]))),
             _PREPARE_TIMEOUT,
             f"{node} was not ready",
         )

@@ -1,4 +1,4 @@
-"""Deformable mirrors: Gaussian influence functions, what the sensors see of them, and the loop's delay."""
+"""Deformable mirrors: influence functions, what the sensors see of them, and the loop's delay."""
 
 from __future__ import annotations
 
@@ -8,8 +8,10 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.ndimage import map_coordinates
 from scipy.special import erf
 
+from srtomo_core.influence import InfluenceFunctions
 from srtomo_core.layout import Array, Layout, MirrorLayout, SensorLayout
 from srtomo_core.system import Direction, System
 from srtomo_sim.shack_hartmann import lit_fractions
@@ -29,7 +31,11 @@ def mirror_phase(layout: Layout, x: Array, y: Array, direction: Direction) -> Ar
     for i, mirror in enumerate(layout.mirrors):
         dx = (x + mirror.altitude * direction.x)[:, None] - mirror.actuators[:, 0]
         dy = (y + mirror.altitude * direction.y)[:, None] - mirror.actuators[:, 1]
-        phase[:, layout.commands_of(i)] = np.exp(-(dx**2 + dy**2) / _width(mirror) ** 2)
+        if mirror.functions is None:
+            phase[:, layout.commands_of(i)] = np.exp(-(dx**2 + dy**2) / _width(mirror) ** 2)
+        else:
+            for a, command in enumerate(range(layout.n_commands)[layout.commands_of(i)]):
+                phase[:, command] = _from_file(mirror, mirror.functions, a, dx[:, a], dy[:, a])
     return phase
 
 
@@ -37,7 +43,8 @@ def interaction_matrix(system: System, layout: Layout) -> Array:
     """Slopes that unit commands add to the wavefront: (n_slopes, n_commands), rad per m.
 
     The gradient of each influence function is averaged over the lit part of each sub-aperture, in closed form over
-    cells of at most 5 cm: a Gaussian is a product of Gaussians along any axes, the sensor's own included.
+    cells of at most 5 cm: a Gaussian is a product of Gaussians along any axes, the sensor's own included. Of a function
+    from a file, a cell's mean gradient is the difference between opposite edges.
     """
     matrix = np.empty((layout.n_slopes, layout.n_commands))
     for i, sensor in enumerate(layout.sensors):
@@ -47,7 +54,8 @@ def interaction_matrix(system: System, layout: Layout) -> Array:
         star = system.star_of(system.sensors[i])
         for j, mirror in enumerate(layout.mirrors):
             cone = 1 - mirror.altitude / system.los_range(star)
-            block = _seen(sensor, light, mirror, cone, star.position)
+            seen = _seen if mirror.functions is None else _seen_from_file
+            block = seen(sensor, light, mirror, cone, star.position)
             matrix[layout.slopes_of(i), layout.commands_of(j)] = block
     return matrix
 
@@ -56,22 +64,74 @@ def _seen(sensor: SensorLayout, light: Array, mirror: MirrorLayout, cone: float,
     """(n_slopes, n_actuators) of one sensor and one mirror; ``light`` (n_valid, cells, cells) sums to 1."""
     across = light.shape[1]
     n = len(sensor.mask)
-    # actuators in the sensor's own axes, where a pupil point p is at p cone + altitude direction on the mirror
-    away = (mirror.actuators - mirror.altitude * np.array([direction.x, direction.y])) / cone - np.array(sensor.shift)
-    c, s = math.cos(sensor.rotation), math.sin(sensor.rotation)
-    at_x, at_y = c * away[:, 0] + s * away[:, 1], c * away[:, 1] - s * away[:, 0]
+    at_x, at_y = _in_sensor_axes(sensor, mirror, cone, direction)
     width = _width(mirror) / cone
     edges = (np.arange(n * across + 1) / across - n / 2) * sensor.size
     mean_x, step_x = _means(edges, at_x, width)
     mean_y, step_y = _means(edges, at_y, width)
-    block = np.empty((2, sensor.n_valid, len(away)))
+    block = np.empty((2, sensor.n_valid, len(at_x)))
     rows, columns = np.nonzero(sensor.mask)
     for k in range(sensor.n_valid):
         in_x = slice(columns[k] * across, (columns[k] + 1) * across)
         in_y = slice(rows[k] * across, (rows[k] + 1) * across)
         block[0, k] = (mean_y[in_y] * (light[k] @ step_x[in_x])).sum(axis=0)
         block[1, k] = (step_y[in_y] * (light[k] @ mean_x[in_x])).sum(axis=0)
-    return block.reshape(-1, len(away))
+    return block.reshape(-1, len(at_x))
+
+
+def _in_sensor_axes(sensor: SensorLayout, mirror: MirrorLayout, cone: float, direction: Direction) -> Array:
+    """(2, n_actuators) x and y, where a pupil point p is at p cone + altitude direction on the mirror."""
+    away = (mirror.actuators - mirror.altitude * np.array([direction.x, direction.y])) / cone - np.array(sensor.shift)
+    c, s = math.cos(sensor.rotation), math.sin(sensor.rotation)
+    return np.stack([c * away[:, 0] + s * away[:, 1], c * away[:, 1] - s * away[:, 0]])
+
+
+def _seen_from_file(
+    sensor: SensorLayout, light: Array, mirror: MirrorLayout, cone: float, direction: Direction
+) -> Array:
+    """As :func:`_seen`, for influence functions from a file."""
+    functions = mirror.functions
+    assert functions is not None
+    across, n = light.shape[1], len(sensor.mask)
+    cell = sensor.size / across
+    # edges of the cells, and the middles between them
+    line = (np.arange(2 * n * across + 1) / (2 * across) - n / 2) * sensor.size
+    reach = math.sqrt(2) * functions.reach / cone + cell
+    block = np.zeros((2, sensor.n_valid, mirror.n_actuators))
+    c, s = math.cos(sensor.rotation), math.sin(sensor.rotation)
+    for a, (at_x, at_y) in enumerate(_in_sensor_axes(sensor, mirror, cone, direction).T):
+        columns, rows = (_cells_near(line[::2], at, reach) for at in (at_x, at_y))
+        if columns.start >= columns.stop or rows.start >= rows.stop:
+            continue
+        points = (line[2 * cells.start : 2 * cells.stop + 1] for cells in (columns, rows))
+        x, y = np.meshgrid(*points)
+        x, y = cone * (x - at_x), cone * (y - at_y)
+        seen = _from_file(mirror, functions, a, c * x - s * y, s * x + c * y)
+        # Simpson's rule along each edge
+        on_x_edges = (seen[:-2:2, ::2] + 4 * seen[1::2, ::2] + seen[2::2, ::2]) / 6
+        on_y_edges = (seen[::2, :-2:2] + 4 * seen[::2, 1::2] + seen[::2, 2::2]) / 6
+        for axis, step in enumerate((np.diff(on_x_edges, axis=1), np.diff(on_y_edges, axis=0))):
+            gradients = np.zeros((n * across, n * across))
+            gradients[rows, columns] = step / cell
+            of_lenslets = gradients.reshape(n, across, n, across).swapaxes(1, 2)[sensor.mask]
+            block[axis, :, a] = (of_lenslets * light).sum(axis=(1, 2))
+    return block.reshape(-1, mirror.n_actuators)
+
+
+def _cells_near(edges: Array, centre: float, reach: float) -> slice:
+    first, last = np.searchsorted(edges, [centre - reach, centre + reach])
+    return slice(max(int(first) - 1, 0), min(int(last), len(edges) - 1))
+
+
+def _from_file(mirror: MirrorLayout, functions: InfluenceFunctions, actuator: int, dx: Array, dy: Array) -> Array:
+    """One influence function at places (m, any shape) from its actuator, by cubic interpolation."""
+    c, s = math.cos(mirror.rotation), math.sin(mirror.rotation)
+    middle = functions.reach / functions.step
+    places = np.stack([c * dy - s * dx, c * dx + s * dy]) / functions.step + middle
+    out = np.zeros(dx.shape)
+    near = (np.abs(places - middle) <= middle).all(axis=0)
+    out[near] = map_coordinates(functions.of(actuator), places[:, near], order=3)
+    return out
 
 
 def _means(edges: Array, centres: Array, width: float) -> tuple[Array, Array]:

@@ -19,7 +19,7 @@ from srtomo_core.layout import Layout
 from srtomo_core.reconstructor import Reconstructor
 from srtomo_core.system import System
 from srtomo_srtc.memory import require
-from srtomo_srtc.model import noise_prior
+from srtomo_srtc.model import noise_covariance
 from srtomo_srtc.reconstructors.implicit import implicit
 
 NODES_PER_DECADE = 5
@@ -122,8 +122,8 @@ class Bank:
         same_but["atmosphere.r0"] = own.atmosphere.r0
         if len(system.sensors) != len(own.sensors) or system.with_changes(same_but) != own:
             raise ValueError("bank: expected the system that it was built for, but for r0 and photons")
-        after, before = (noise_prior(s, Layout(s), s.loop.gain) for s in (system, own))
-        ratio = after / before
+        after, before = (noise_covariance(s, Layout(s), s.loop.gain) for s in (system, own))
+        ratio = after.data / before.data
         factor = math.exp(float(np.mean(np.log(ratio))))
         if max(ratio.max() / factor, factor / ratio.min()) > 1 + _COMMON:
             raise ValueError(

@@ -12,6 +12,7 @@ from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import sparse
 from scipy.linalg import cho_factor, cho_solve
 
 from srtomo_srtc.model import project, project_both_sides
@@ -65,7 +66,7 @@ def _project_rows(matrix: NDArray[np.floating], blind: Array) -> None:
 
 
 def commands_from(
-    S: Array, right: Array, blind: Array, fit: Callable[[Array], Array], split: Split | None, noise: Array
+    S: Array, right: Array, blind: Array, fit: Callable[[Array], Array], split: Split | None, noise: sparse.csr_array
 ) -> Array:
     """The reconstructor, from all slopes together or with tip-tilt split off.
 
@@ -73,7 +74,8 @@ def commands_from(
         S, right, blind: as :func:`estimator` takes them.
         fit: x (n, n_slopes) to commands (n_commands, n_slopes), column by column.
         split: who estimates what; everyone everything when None.
-        noise: (n_slopes,) the variances in S that are noise, rad^2; only natural stars' matter, and only to ``split``.
+        noise: (n_slopes, n_slopes) the part of S that is noise, rad^2; only natural stars' matters, and only to
+            ``split``.
 
     Returns:
         (n_commands, n_slopes) R, m/rad.
@@ -85,7 +87,7 @@ def commands_from(
     high_order = fit(estimator(S[np.ix_(lasers, lasers)], right[lasers], _within(blind, lasers)).T)
     R[:, lasers] = high_order - split.low_order @ high_order
     own = S[np.ix_(natural, natural)]
-    low_order = (own - np.diag(noise[natural])) @ split.measured[:, natural].T
+    low_order = (own - noise[natural][:, natural].toarray()) @ split.measured[:, natural].T
     R[:, natural] = split.answer @ estimator(own, low_order, _within(blind, natural)).T
     return R
 

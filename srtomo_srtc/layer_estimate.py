@@ -126,6 +126,8 @@ class _Information:
 
         entries = np.diff(H.indptr)
         long = entries > _LONG * np.median(entries)
+        # with the rows that they share noise with
+        long = abs(self._precision) @ long.astype(np.float64) > 0
         rows, far = np.flatnonzero(~long), np.flatnonzero(long)
         self._H = H[rows]
         self._HtN = (self._H.T @ self._precision[rows][:, rows]).tocsr()

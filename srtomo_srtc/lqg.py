@@ -37,7 +37,7 @@ from srtomo_srtc.covariance import (
 from srtomo_srtc.fitting import Fit
 from srtomo_srtc.geometry import Footprints
 from srtomo_srtc.mirrors import interaction_matrix
-from srtomo_srtc.model import blind_modes, layout_of, noise_prior, project, sightlines
+from srtomo_srtc.model import blind_modes, layout_of, noise_covariance, project, sightlines
 from srtomo_srtc.wind import carried, winds
 
 Array = NDArray[np.float64]
@@ -96,7 +96,7 @@ def layered_model(system: System, layout: Layout | None = None, *, step: float |
 
     blind = blind_modes(system, layout)
     states = []
-    residual = np.diag(noise_prior(system, layout, gain=1.0))
+    residual = noise_covariance(system, layout, gain=1.0).toarray()
     to_slopes, to_wavefront = [], []
     for l, (x, y) in enumerate(grids):
         alone = Profile(profile.r0, profile.outer_scale, profile.heights[l : l + 1], profile.fractions[l : l + 1])

@@ -1,4 +1,7 @@
-"""Deformable mirrors: Gaussian influence functions, the model's interaction matrix, and the phase they can fit."""
+"""Deformable mirrors: influence functions, the model's interaction matrix, and the phase they can fit.
+
+Gaussians here; functions from a file in :mod:`srtomo_srtc.influence`.
+"""
 
 from __future__ import annotations
 
@@ -13,6 +16,7 @@ from scipy import sparse
 from srtomo_core.layout import Layout, MirrorLayout
 from srtomo_core.system import Direction, System
 from srtomo_srtc.geometry import cell_light, footprints
+from srtomo_srtc.influence import Splines
 from srtomo_srtc.parallel import run
 
 Array = NDArray[np.float64]
@@ -25,7 +29,7 @@ _FAINT = 25.0  # exp(-25) is 1e-11: left out where most actuators are far away
 
 
 def influence(mirror: MirrorLayout, x: Array, y: Array) -> Array:
-    """Influence functions ``coupling^(rho^2 / pitch^2)`` at points of the mirror's conjugate plane.
+    """Influence functions at points of the mirror's conjugate plane: ``coupling^(rho^2 / pitch^2)`` or from its file.
 
     Args:
         x, y: (n_points,) m.
@@ -33,6 +37,8 @@ def influence(mirror: MirrorLayout, x: Array, y: Array) -> Array:
     Returns:
         (n_points, n_actuators) metres of wavefront per metre of command.
     """
+    if mirror.functions is not None:
+        return Splines.of(mirror.functions).values(mirror, x, y)
     out = np.empty((len(x), mirror.n_actuators))
     _influence(x, y, mirror.actuators, _decay(mirror), out)
     return out
@@ -64,6 +70,9 @@ def sparse_wavefronts(layout: Layout, x: Array, y: Array, direction: Direction) 
     seen = footprints(x, y, direction, math.inf, heights)
     parts = []
     for i, mirror in enumerate(layout.mirrors):
+        if mirror.functions is not None:
+            parts.append(Splines.of(mirror.functions).sparse_values(mirror, seen.x[i], seen.y[i]))
+            continue
         reach = math.sqrt(_FAINT / _decay(mirror))
         start = np.concatenate([[0], np.cumsum(_count_near(seen.x[i], seen.y[i], mirror.actuators, reach))])
         indices, values = np.empty(start[-1], np.int32), np.empty(start[-1])
@@ -75,7 +84,7 @@ def sparse_wavefronts(layout: Layout, x: Array, y: Array, direction: Direction) 
 def interaction_matrix(system: System, layout: Layout, threads: int = 1) -> Array:
     """Slopes of the mirrors' own wavefront, G in ``y = s - G m``.
 
-    The influence functions' analytic gradients, along each sensor's own axes, averaged over each sub-aperture's light.
+    The influence functions' gradients, along each sensor's own axes, averaged over each sub-aperture's light.
 
     Args:
         threads: to compute with, sensor by sensor.
@@ -101,16 +110,13 @@ def _sensor_response(system: System, layout: Layout, w: int, out: Array) -> None
     )
     for m, mirror in enumerate(layout.mirrors):
         cone = 1 - mirror.altitude / system.los_range(star)
-        _mean_gradients(
-            cone * x + mirror.altitude * star.position.x,
-            cone * y + mirror.altitude * star.position.y,
-            cone * light,
-            math.cos(place.rotation),
-            math.sin(place.rotation),
-            mirror.actuators,
-            _decay(mirror),
-            out[layout.slopes_of(w), layout.commands_of(m)],
-        )
+        at = cone * x + mirror.altitude * star.position.x, cone * y + mirror.altitude * star.position.y
+        own = out[layout.slopes_of(w), layout.commands_of(m)]
+        if mirror.functions is not None:
+            Splines.of(mirror.functions).mean_gradients(mirror, *at, cone * light, place.rotation, own)
+            continue
+        axes = math.cos(place.rotation), math.sin(place.rotation)
+        _mean_gradients(*at, cone * light, *axes, mirror.actuators, _decay(mirror), own)
 
 
 def _decay(mirror: MirrorLayout) -> float:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
+from scipy import sparse
 
 from srtomo_core.layout import Layout
 from srtomo_core.system import System
@@ -11,10 +14,12 @@ from srtomo_srtc.atmosphere import Profile
 from srtomo_srtc.covariance import Sightline
 from srtomo_srtc.geometry import SeenLattice, cell_light, footprints
 from srtomo_srtc.gradient import OVERSAMPLING, gradient_operator
-from srtomo_srtc.noise import slope_noise
+from srtomo_srtc.memory import require
+from srtomo_srtc.noise import MeasuredNoise, SlopeNoise, sensor_noise
 
 Array = NDArray[np.float64]
 
+_BYTES_OF_MEASURED = 60.0  # an entry, while the sensors' blocks become one sparse matrix
 _LIGHT_POINTS = 32  # across a sub-aperture when the centroid of its light is found
 
 
@@ -50,26 +55,41 @@ def sightlines(system: System, layout: Layout, profile: Profile, oversampling: i
     return lines
 
 
-def noise_prior(system: System, layout: Layout, gain: float) -> Array:
-    """(n_slopes,) slope variances, rad^2, as a loop of this gain passes them on: ``g / (2-g)`` of the sensor's."""
-    pairs = zip(system.sensors, layout.sensors, strict=True)
-    return gain / (2 - gain) * np.concatenate([slope_noise(system, s, place).variance for s, place in pairs])
+def noise_covariance(system: System, layout: Layout, gain: float) -> sparse.csr_array:
+    """Sigma_nn as a loop of this gain passes it on: ``g / (2-g)`` of the sensors' variances.
 
-
-def elongation_prior(system: System, layout: Layout, gain: float) -> tuple[NDArray[np.intp], NDArray[np.intp], Array]:
-    """What :func:`noise_prior` leaves out where spots are elongated: the covariance of a sub-aperture's y with its x.
+    All of it: photons and read-out, the covariance of x with y where spots are elongated, measured ones from files.
 
     Returns:
-        Rows, columns and values (rad^2) of the noise covariance's entries below the diagonal; none for round spots.
+        (n_slopes, n_slopes) rad^2; sensors are independent of each other.
+
+    Raises:
+        ValueError: a file with a measured covariance cannot be used.
+        MemoryError: one line, before any work, if there is not enough for measured covariances.
     """
-    rows, columns, values = [], [], []
-    for w, (sensor, place) in enumerate(zip(system.sensors, layout.sensors, strict=True)):
-        covariance = slope_noise(system, sensor, place).covariance
-        elongated = np.flatnonzero(covariance)
-        columns.append(layout.slopes_of(w).start + elongated)
-        rows.append(columns[-1] + place.n_valid)
-        values.append(gain / (2 - gain) * covariance[elongated])
-    return np.concatenate(rows), np.concatenate(columns), np.concatenate(values)
+    blocks = [noise.matrix() for noise in _noises(system, layout)]
+    return sparse.csr_array(gain / (2 - gain) * sparse.block_diag(blocks, format="csr"))
+
+
+def noise_whitening(system: System, layout: Layout, gain: float) -> sparse.csr_array:
+    """W with ``W Sigma_nn W^T = I`` and ``Sigma_nn^-1 = W^T W``, for :func:`noise_covariance`'s Sigma_nn.
+
+    Returns:
+        (n_slopes, n_slopes) lower triangular, 1/rad.
+
+    Raises:
+        ValueError, MemoryError: as :func:`noise_covariance`.
+    """
+    blocks = [noise.whitening() for noise in _noises(system, layout)]
+    return sparse.csr_array(math.sqrt((2 - gain) / gain) * sparse.block_diag(blocks, format="csr"))
+
+
+def _noises(system: System, layout: Layout) -> list[SlopeNoise | MeasuredNoise]:
+    pairs = list(zip(system.sensors, layout.sensors, strict=True))
+    measured = sum(place.n_slopes**2 for sensor, place in pairs if sensor.noise_covariance is not None)
+    if measured:
+        require(_BYTES_OF_MEASURED * measured, f"measured noise of {system.name}")
+    return [sensor_noise(system, sensor, place) for sensor, place in pairs]
 
 
 def low_order_slopes(system: System, layout: Layout, sensor: int) -> tuple[Array, Array]:

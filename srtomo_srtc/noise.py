@@ -4,14 +4,20 @@ A laser star is a column as long as the sodium layer is thick. From a point of t
 more the farther that point is from where the laser leaves: the spot is stretched by ``thickness * distance / range^2``
 along the line to it. Its photon noise is then larger along that line, and x and y of a sub-aperture go together
 (section 3.1.3). The layer is taken to be Gaussian and the spot to fit into the sub-aperture's field.
+
+A covariance measured on the sensor itself, from a file, takes the place of all this.
 """
 
 from __future__ import annotations
 
+import math
+import zipfile
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import sparse
+from scipy.linalg import solve_triangular
 
 from srtomo_core.layout import SensorLayout
 from srtomo_core.system import Sensor, System
@@ -19,6 +25,7 @@ from srtomo_core.system import Sensor, System
 Array = NDArray[np.float64]
 
 _FWHM_PER_SIGMA = 2.355
+_SYMMETRIC = 1e-6  # how far a measured covariance may be from it, of its largest entry
 
 
 class SlopeNoise(NamedTuple):
@@ -31,6 +38,72 @@ class SlopeNoise(NamedTuple):
 
     variance: Array
     covariance: Array
+
+    def matrix(self) -> sparse.csr_array:
+        """(n_slopes, n_slopes) N, rad^2."""
+        x, y = np.split(self.variance, 2)
+        return _two_by_two(x, self.covariance, self.covariance, y)
+
+    def whitening(self) -> sparse.csr_array:
+        """(n_slopes, n_slopes) W with ``W N W^T = I``, the inverse of N's Cholesky factor, 1/rad."""
+        x, y = np.split(self.variance, 2)
+        left = np.sqrt(y - self.covariance**2 / x)
+        return _two_by_two(1 / np.sqrt(x), np.zeros(len(x)), -self.covariance / (x * left), 1 / left)
+
+
+class MeasuredNoise(NamedTuple):
+    """Noise of one sensor as it was measured.
+
+    Attributes:
+        covariance: (n_slopes, n_slopes) rad^2.
+    """
+
+    covariance: Array
+
+    def matrix(self) -> sparse.csr_array:
+        """(n_slopes, n_slopes) N, rad^2."""
+        return sparse.csr_array(self.covariance)
+
+    def whitening(self) -> sparse.csr_array:
+        """(n_slopes, n_slopes) W with ``W N W^T = I``, the inverse of N's Cholesky factor, 1/rad."""
+        factor = np.linalg.cholesky(self.covariance)
+        return sparse.csr_array(solve_triangular(factor, np.eye(len(factor)), lower=True))
+
+
+def sensor_noise(system: System, sensor: Sensor, layout: SensorLayout) -> SlopeNoise | MeasuredNoise:
+    """Noise of a sensor: measured if its file is given, else by :func:`slope_noise`.
+
+    Raises:
+        ValueError: the file cannot be read, or does not hold a covariance of this sensor's slopes.
+    """
+    if sensor.noise_covariance is None:
+        return slope_noise(system, sensor, layout)
+    return read_noise(sensor.noise_covariance, layout.n_slopes)
+
+
+def read_noise(path: str, n_slopes: int) -> MeasuredNoise:
+    """Read ``covariance`` (n_slopes, n_slopes), rad^2, all x then all y, of one frame, from an ``.npz`` file.
+
+    Raises:
+        ValueError: in one line, what is wrong with it.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            covariance = np.asarray(file["covariance"], dtype=np.float64)
+    except OSError as error:
+        raise ValueError(f"{path}: {error.strerror or error}") from None
+    except (KeyError, TypeError, ValueError, zipfile.BadZipFile):
+        raise ValueError(f"{path}: expected an .npz file with numbers in 'covariance'") from None
+    if covariance.shape != (n_slopes, n_slopes):
+        raise ValueError(f"{path}: covariance: expected shape {(n_slopes, n_slopes)}, got {covariance.shape}")
+    if not np.abs(covariance - covariance.T).max() <= _SYMMETRIC * np.abs(covariance).max() < math.inf:
+        raise ValueError(f"{path}: covariance: expected finite numbers, symmetric")
+    covariance = (covariance + covariance.T) / 2
+    try:
+        np.linalg.cholesky(covariance)
+    except np.linalg.LinAlgError:
+        raise ValueError(f"{path}: covariance: expected positive definite; are there frames enough?") from None
+    return MeasuredNoise(covariance)
 
 
 def slope_variance(sensor: Sensor, layout: SensorLayout, rate: float) -> Array:
@@ -72,3 +145,12 @@ def slope_noise(system: System, sensor: Sensor, layout: SensorLayout) -> SlopeNo
 def _electrons(sensor: Sensor, layout: SensorLayout, rate: float) -> Array:
     """(n_valid,) detected in a frame."""
     return sensor.photons * layout.size**2 * layout.illumination / rate
+
+
+def _two_by_two(xx: Array, xy: Array, yx: Array, yy: Array) -> sparse.csr_array:
+    """Each (n_valid,), on four diagonals; zeros are not kept."""
+    n = len(xx)
+    matrix = sparse.diags_array([np.concatenate([xx, yy]), xy, yx], offsets=[0, n, -n], shape=(2 * n, 2 * n))
+    matrix = sparse.csr_array(matrix)
+    matrix.eliminate_zeros()
+    return matrix

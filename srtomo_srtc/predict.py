@@ -37,7 +37,7 @@ from srtomo_srtc.fitting import KAPPA
 from srtomo_srtc.geometry import PupilGrid, footprints, pupil_grid
 from srtomo_srtc.memory import require
 from srtomo_srtc.mirrors import interaction_matrix, mirror_wavefronts
-from srtomo_srtc.model import blind_modes, noise_prior, sightlines
+from srtomo_srtc.model import blind_modes, noise_covariance, sightlines
 from srtomo_srtc.wind import carried, sensors_carried, winds
 
 Array = NDArray[np.float64]
@@ -222,7 +222,7 @@ class Prediction:
                 progress("slope covariance", 0.1 + 0.4 * n / len(differences.nodes))
                 later = _lagged(turbulence, sensors, sensors_carried(sensors, velocity, time))
                 self._moving += weight * (later + later.T)
-        self._noise = noise_prior(system, self.layout, system.loop.gain)
+        self._noise = noise_covariance(system, self.layout, system.loop.gain)
         self._jitter = _jitter(system, self.layout)
 
         hidden = _HIDDEN * METRES_PER_RADIAN**2 * (pitch / profile.r0) ** (5 / 3)
@@ -249,7 +249,7 @@ class Prediction:
         Blind modes are left alone; of mirror shapes that the pupil does not show, as little as need be.
         """
         blind = blind_modes(self.system, self.layout)
-        S = self._still + np.diag(self._noise)
+        S = self._still + self._noise.toarray()
         gram = np.zeros((self.layout.n_commands, self.layout.n_commands))
         right = np.zeros((self.layout.n_commands, self.layout.n_slopes))
         for view in self._views:
@@ -280,7 +280,7 @@ class Prediction:
         still = R @ self._still @ R.T
         moving = still if self._moving is self._still else R @ self._moving @ R.T
         shaken = R @ self._jitter
-        noise = (R * self._noise) @ R.T + shaken @ shaken.T
+        noise = (R @ self._noise) @ R.T + shaken @ shaken.T
 
         def variances(q: _Quadratic) -> tuple[float, float, float]:
             return (
@@ -370,7 +370,9 @@ def moved_mirrors(
     turn = np.array([[c, s], [-s, c]])  # of row vectors
     moved = copy.copy(layout)
     moved.mirrors = tuple(
-        replace(m, actuators=m.actuators @ turn + np.array(shift)) if not names or m.name in names else m
+        replace(m, actuators=m.actuators @ turn + np.array(shift), rotation=m.rotation + rotation)
+        if not names or m.name in names
+        else m
         for m in layout.mirrors
     )
     return moved

@@ -68,7 +68,15 @@ def provenance(system: System, method: str, gain: float, seconds: dict[str, floa
             "sensors": {
                 sensor.name: sensor.model_dump(
                     mode="json",
-                    include={"photons", "spot_fwhm", "excess_noise", "read_noise", "pixels", "pixel_scale"},
+                    include={
+                        "photons",
+                        "spot_fwhm",
+                        "excess_noise",
+                        "read_noise",
+                        "pixels",
+                        "pixel_scale",
+                        "noise_covariance",
+                    },
                 )
                 for sensor in system.sensors
             },

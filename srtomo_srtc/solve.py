@@ -12,6 +12,7 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
+from scipy import sparse
 from scipy.linalg import get_lapack_funcs
 
 from srtomo_srtc.parallel import Progress, run, silent
@@ -85,18 +86,13 @@ class SymmetricTiles:
         """Sum of the diagonal."""
         return float(sum(row[-1].trace(dtype=np.float64) for row in self.tiles))
 
-    def add_diagonal(self, values: Matrix) -> None:
-        """S += diag(values), (n,)."""
+    def add(self, matrix: sparse.csr_array) -> None:
+        """S += a sparse symmetric matrix (n, n)."""
         for i, row in enumerate(self.tiles):
-            row[-1][np.diag_indices(len(row[-1]))] += values[self._part(i)].astype(self.dtype)
-
-    def add_below_diagonal(self, rows: NDArray[np.intp], columns: NDArray[np.intp], values: Matrix) -> None:
-        """Add to single entries, each below the diagonal and given once."""
-        i, j = (np.searchsorted(self.starts, index, side="right") - 1 for index in (rows, columns))
-        for tile in {*zip(i.tolist(), j.tolist())}:
-            mine = (i == tile[0]) & (j == tile[1])
-            place = rows[mine] - self.starts[tile[0]], columns[mine] - self.starts[tile[1]]
-            self.tiles[tile[0]][tile[1]][place] += values[mine].astype(self.dtype)
+            strip = matrix[self._part(i)]
+            for j, tile in enumerate(row):
+                part = strip[:, self._part(j)].tocoo()
+                tile[part.row, part.col] += part.data.astype(self.dtype)
 
     def product(self, B: Matrix) -> NDArray[np.float64]:
         """S B, (n, m), before :meth:`factor`."""

@@ -10,7 +10,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import DTypeLike
-from scipy import sparse
 
 from srtomo_core.layout import Layout
 from srtomo_core.reconstructor import Reconstructor
@@ -20,7 +19,7 @@ from srtomo_srtc.covariance import Sightline, Turbulence, slope_wavefront_covari
 from srtomo_srtc.crossterms import right_hand_side
 from srtomo_srtc.fitting import Fit
 from srtomo_srtc.geometry import Footprints
-from srtomo_srtc.model import elongation_prior, noise_prior, sightlines
+from srtomo_srtc.model import noise_covariance, sightlines
 from srtomo_srtc.parallel import run
 from srtomo_srtc.reconstructors import implicit
 
@@ -123,20 +122,12 @@ def residual_of(system: System, reconstructor: Reconstructor, seed: int = 0) -> 
         profile, [*(s.nodes for s in sensors), *(points for _, points in fit.footprints(profile.heights))]
     )
     covariance = np.hstack([slope_wavefront_covariance(turbulence, sensors, s.nodes) @ s.gradient.T for s in samples])
-    covariance += _noise(system, layout)[:, columns].toarray()
+    covariance += noise_covariance(system, layout, system.loop.gain)[:, columns].toarray()
     # float32 suffices, and R is large
     found = reconstructor.R[0] @ covariance.astype(np.float32)
     wanted = fit.solve(right_hand_side(fit, turbulence, samples, profile.heights))
     error, scale = (matrix[:, ::2] - matrix[:, 1::2] for matrix in (found - wanted, wanted))
     return float(np.linalg.norm(error) / np.linalg.norm(scale))
-
-
-def _noise(system: System, layout: Layout) -> sparse.csr_array:
-    """(n_slopes, n_slopes) Sigma_nn, rad^2."""
-    n, gain = layout.n_slopes, system.loop.gain
-    rows, below, values = elongation_prior(system, layout, gain)
-    lower = sparse.csr_array((values, (rows, below)), shape=(n, n))
-    return sparse.csr_array(sparse.diags_array(noise_prior(system, layout, gain)) + lower + lower.T)
 
 
 def _some_slopes(sensor: Sightline, slopes: np.ndarray) -> Sightline:

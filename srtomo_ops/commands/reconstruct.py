@@ -4,17 +4,73 @@ from __future__ import annotations
 
 import argparse
 import inspect
+import textwrap
 import time
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from types import UnionType
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from srtomo_ops.options import add_json, add_system, assignments, system_of, writable_file, write_json
 from srtomo_ops.progress import Progress
 from srtomo_srtc.model import ground_prior
 from srtomo_srtc.reconstructors import METHODS
 
-EXAMPLE = """examples:
+_SHARED = ("system", "layout", "label", "progress")  # parameters that have options of their own, or none
+
+
+def own_keywords(method: str) -> dict[str, str]:
+    """A method's parameters that a command line can give, each as ``name=default|other|choices``.
+
+    In brackets where the method finds a value itself if none is given.
+    """
+    hints = get_type_hints(METHODS[method])
+    out = {}
+    for name, parameter in inspect.signature(METHODS[method]).parameters.items():
+        if name in _SHARED or not _can_be_typed(hints[name]):
+            continue
+        default = parameter.default
+        shown = [] if default is None else [f"{default:g}" if isinstance(default, float) else str(default).lower()]
+        values = "|".join(dict.fromkeys([*shown, *_choices(hints[name])]))
+        text = f"{name}={values}" if values else name
+        out[name] = f"[{text}]" if default is None else text
+    return out
+
+
+def _can_be_typed(hint: Any) -> bool:
+    if get_origin(hint) in (Union, UnionType):
+        return all(_can_be_typed(part) for part in get_args(hint))
+    return hint in (str, int, float, bool, type(None), Sequence[float]) or get_origin(hint) is Literal
+
+
+def _choices(hint: Any) -> list[str]:
+    if get_origin(hint) is Literal:
+        return list(get_args(hint))
+    return [choice for part in get_args(hint) for choice in _choices(part)]
+
+
+def _list_of_methods() -> str:
+    lines = []
+    for method in sorted(METHODS):
+        lines.append(
+            textwrap.fill(
+                " ".join(own_keywords(method).values()),
+                100,
+                initial_indent=f"  {method:<14}",
+                subsequent_indent=16 * " ",
+                break_long_words=False,
+                break_on_hyphens=False,
+            )
+        )
+    return "\n".join(lines)
+
+
+EXAMPLE = f"""methods, and what --with can set of each, with defaults (SI units; in brackets: found by itself):
+{_list_of_methods()}
+
+examples:
   srtomo reconstruct gnao_ltao_sr -o sr.npz
+  srtomo reconstruct gnao_ltao_sr --method explicit --with prior=laplacian --with solver=cg -o sparse.npz
   srtomo reconstruct mini --prior ground --with kappa=1e-3 -o mini.npz"""
 
 
@@ -29,7 +85,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help="turbulence profile supposed: the instrument file's, or all of it at the ground (default: file)",
     )
     parser.add_argument(
-        "--method", choices=sorted(METHODS), default="implicit", help="how (default: implicit); see the docstrings"
+        "--method", choices=sorted(METHODS), default="implicit", help="how (default: implicit); all are listed below"
     )
     parser.add_argument(
         "--with",
@@ -37,7 +93,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         metavar="KEY=VALUE",
         action="append",
         default=[],
-        help="a parameter of the method, e.g. --with kappa=1e-3",
+        help="a parameter of the method; all are listed below",
     )
     parser.add_argument("--label", default="", help="a name for people (default: the prior)")
     add_json(parser)
@@ -49,8 +105,7 @@ def keywords_of(options: argparse.Namespace) -> dict[str, Any]:
     Raises:
         ValueError: the method has no such parameter.
     """
-    names = inspect.signature(METHODS[options.method]).parameters
-    own = [name for name in names if name not in ("system", "layout", "label", "progress")]
+    own = own_keywords(options.method)
     keywords = assignments(options.keywords, "--with")
     for key in keywords:
         if key not in own:

@@ -23,7 +23,7 @@ from srtomo_srtc.layer_estimate import COLUMNS, covariance_form, information_for
 from srtomo_srtc.layer_prior import exact_covariance, exact_inverse, sparse_inverse
 from srtomo_srtc.memory import require
 from srtomo_srtc.mirrors import interaction_matrix
-from srtomo_srtc.model import blind_modes, layout_of, noise_prior, sightlines
+from srtomo_srtc.model import blind_modes, layout_of, noise_covariance, noise_whitening, sightlines
 from srtomo_srtc.provenance import Stages, reconstructor_of
 from srtomo_srtc.raytrace import layer_grids, propagation
 
@@ -94,7 +94,6 @@ def explicit(
     sizes = np.array([grid.n_nodes for grid in grids])
     require(_memory(form, prior, solver, sizes, layout), f"explicit {form} form on {sizes.sum()} nodes")
     H = sparse.vstack([s.gradient @ propagation(grids, s.nodes) for s in sensors], format="csr")
-    noise = sparse.diags_array(noise_prior(system, layout, gain))
     blind = blind_modes(system, layout)
 
     stages.enter("interaction matrix", 0.05)
@@ -112,13 +111,14 @@ def explicit(
 
     stages.enter("solution", 0.2)
     if form == "covariance":
-        R = covariance_form(wanted, H, blocks, noise, blind)
+        R = covariance_form(wanted, H, blocks, noise_covariance(system, layout, gain), blind)
     else:
+        whitening = noise_whitening(system, layout, gain)
         R = information_form(
             wanted,
             H,
             blocks,
-            sparse.diags_array(1 / noise.diagonal()),
+            whitening.T @ whitening,
             blind,
             coarse=[grid.refinement(_COARSER) for grid in grids] if solver == "cg" else None,
             tolerance=tolerance,

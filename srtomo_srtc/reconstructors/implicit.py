@@ -27,7 +27,7 @@ from srtomo_srtc.fitting import KAPPA, Fit
 from srtomo_srtc.gradient import OVERSAMPLING
 from srtomo_srtc.memory import require
 from srtomo_srtc.mirrors import interaction_matrix
-from srtomo_srtc.model import blind_modes, elongation_prior, noise_prior, sightlines
+from srtomo_srtc.model import blind_modes, noise_covariance, sightlines
 from srtomo_srtc.provenance import Stages, provenance
 from srtomo_srtc.solve import SymmetricTiles
 from srtomo_srtc.split import Split
@@ -92,7 +92,7 @@ def implicit(
         profile,
         [*(s.nodes for s in [*sensors, *later]), *(points for _, points in fit.footprints(profile.heights))],
     )
-    blind, noise = blind_modes(system, layout), noise_prior(system, layout, gain)
+    blind, noise = blind_modes(system, layout), noise_covariance(system, layout, gain)
 
     stages.enter("interaction matrix", 0.1)
     G = interaction_matrix(system, layout, threads)
@@ -102,8 +102,7 @@ def implicit(
 
     stages.enter("slope covariance", 0.5)
     S = slope_tiles(turbulence, sensors, fast=fast, threads=threads)
-    S.add_diagonal(noise)
-    S.add_below_diagonal(*elongation_prior(system, layout, gain))
+    S.add(noise)
 
     stages.enter("solution", 0.6)
     if split:

@@ -5,8 +5,9 @@ sensors that are only shifted against each other correlate by convolution (:mod:
 
 Eq. 39 solves ``(Sigma_ss + N) zeta = s`` for slopes s, and for the reconstructor's columns with unit slopes. The matrix
 is symmetric: rows, of which there are fewer, come from ``(Sigma_ss + N) r = Sigma_s_phi F^T e`` for unit commands e.
-Slopes are counted in standard deviations of their noise, which makes of the matrix ``I + B`` with B of signal-to-noise
-ratios; the few that are large are taken care of by the preconditioner.
+Slopes are counted in standard deviations of their noise, and made independent of each other where spots are elongated,
+which makes of the matrix ``I + B`` with B of signal-to-noise ratios; the few that are large are taken care of by the
+preconditioner.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import sparse
 
 from srtomo_core.layout import Layout
 from srtomo_core.reconstructor import Reconstructor
@@ -26,7 +28,7 @@ from srtomo_srtc.covariance import Turbulence, slope_wavefront_covariance
 from srtomo_srtc.fitting import KAPPA, Fit
 from srtomo_srtc.memory import require
 from srtomo_srtc.mirrors import interaction_matrix
-from srtomo_srtc.model import blind_modes, layout_of, noise_prior, project, sightlines
+from srtomo_srtc.model import blind_modes, layout_of, noise_whitening, project, sightlines
 from srtomo_srtc.provenance import Stages, reconstructor_of
 from srtomo_srtc.toeplitz import ToeplitzCovariance
 
@@ -100,7 +102,11 @@ def iterative(
 
     stages.enter("preconditioner", 0.2)
     solve = solver(
-        covariance.product, noise_prior(system, layout, gain), blind_modes(system, layout), rank, tolerance=tolerance
+        covariance.product,
+        noise_whitening(system, layout, gain),
+        blind_modes(system, layout),
+        rank,
+        tolerance=tolerance,
     )
 
     stages.enter("solution", 0.25)
@@ -122,27 +128,27 @@ def iterative(
     )
 
 
-def solver(product: Operator, noise: Array, blind: Array, rank: int, *, tolerance: float) -> Operator:
+def solver(product: Operator, whitening: sparse.csr_array, blind: Array, rank: int, *, tolerance: float) -> Operator:
     """``P [P (Sigma_ss + N) P + gamma (I - P)]^-1 P`` times slopes (n_slopes, n), by iteration (eq. 39a).
 
     Args:
         product: Sigma_ss times slopes.
-        noise: (n_slopes,) diagonal of N, rad^2.
+        whitening: (n_slopes, n_slopes) W with ``W N W^T = I``, 1/rad.
         blind: (n_slopes, n) M, orthonormal; P = I - M M^T.
         rank: of the preconditioner.
         tolerance: relative residual, in standard deviations of the noise.
     """
-    sigma = np.sqrt(noise)[:, None]
-    outside = np.linalg.qr(blind / sigma)[0]
+    W, Wt = whitening, whitening.T.tocsr()
+    outside = np.linalg.qr(W @ blind)[0]
 
     def signal(z: Array) -> Array:
-        return project(product(project(z, outside) / sigma) / sigma, outside)
+        return project(W @ product(Wt @ project(z, outside)), outside)
 
-    precondition = conjugate_gradients.nystrom(signal, len(noise), rank)
+    precondition = conjugate_gradients.nystrom(signal, W.shape[0], rank)
 
     def solve(b: Array) -> Array:
-        whitened = project(b / sigma, outside)
+        whitened = project(W @ b, outside)
         z = conjugate_gradients.solve(lambda z: z + signal(z), whitened, precondition, tolerance=tolerance)
-        return project(z, outside) / sigma
+        return Wt @ project(z, outside)
 
     return solve

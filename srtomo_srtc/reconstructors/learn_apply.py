@@ -14,6 +14,7 @@ from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import sparse
 
 from srtomo_core.layout import Layout
 from srtomo_core.reconstructor import Reconstructor
@@ -22,7 +23,7 @@ from srtomo_srtc.atmosphere import Profile
 from srtomo_srtc.covariance import Sightline, Turbulence, slope_covariance, wavefront_covariance
 from srtomo_srtc.estimator import commands_from
 from srtomo_srtc.mirrors import interaction_matrix
-from srtomo_srtc.model import blind_modes, layout_of, noise_prior, sightlines
+from srtomo_srtc.model import blind_modes, layout_of, noise_covariance, sightlines
 from srtomo_srtc.provenance import Stages, reconstructor_of
 from srtomo_srtc.reconstructors.least_squares import weighted_inverse
 from srtomo_srtc.split import Split
@@ -100,16 +101,15 @@ def learn_apply(
         virtual_layout.mirrors = layout.mirrors
         control_matrix = weighted_inverse(
             interaction_matrix(virtual, virtual_layout),
-            _target_weights(system, virtual, virtual_layout),
+            sparse.diags_array(_target_weights(system, virtual, virtual_layout)),
             np.zeros((n_virtual, 0)),
             kappa,
         )
 
     stages.enter("slope covariance", 0.3)
-    noise = noise_prior(system, layout, gain)
+    noise = noise_covariance(system, layout, gain)
     if slopes is None:
-        S = slope_covariance(turbulence, sensors)
-        S[np.diag_indices_from(S)] += noise
+        S = slope_covariance(turbulence, sensors) + noise.toarray()
     else:
         S = np.array(slopes, dtype=np.float64)
     stages.enter("virtual-slope covariance", 0.6)
@@ -150,6 +150,7 @@ def virtual_system(system: System, subapertures: int | None = None) -> System:
         name = f"virtual_{i}"
         stars.append({"name": name, "kind": "natural", "position": target.position.model_dump()})
         own = {"name": name, "guide_star": name, "subapertures": subapertures, "shift": (0.0, 0.0), "rotation": 0.0}
+        own["noise_covariance"] = None  # of another sensor
         sensors.append(like.model_dump() | own)
     # the real stars stay: the mirrors' edges depend on the field
     return system.with_changes(

@@ -13,13 +13,14 @@ from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import sparse
 from scipy.linalg import cho_factor, cho_solve
 
 from srtomo_core.layout import Layout
 from srtomo_core.reconstructor import Reconstructor
 from srtomo_core.system import System
 from srtomo_srtc.mirrors import interaction_matrix
-from srtomo_srtc.model import blind_modes, layout_of, noise_prior
+from srtomo_srtc.model import blind_modes, layout_of, noise_whitening
 from srtomo_srtc.provenance import Stages, reconstructor_of
 
 Array = NDArray[np.float64]
@@ -61,25 +62,26 @@ def least_squares(
     G = interaction_matrix(system, layout)
 
     stages.enter("solution", 0.7)
-    R = weighted_inverse(G, 1 / noise_prior(system, layout, gain), blind_modes(system, layout), kappa)
+    whitening = noise_whitening(system, layout, gain)
+    R = weighted_inverse(G, whitening.T @ whitening, blind_modes(system, layout), kappa)
     return reconstructor_of(system, R, G, method="least_squares", label=label, gain=gain, stages=stages, kappa=kappa)
 
 
-def weighted_inverse(D: Array, weight: Array, blind: Array, kappa: float) -> Array:
+def weighted_inverse(D: Array, weight: sparse.sparray, blind: Array, kappa: float) -> Array:
     """``(D^T W D + kappa I)^-1 D^T W`` with no weight on blind modes.
 
     Args:
         D: (n_slopes, n_commands).
-        weight: (n_slopes,) inverse variances, rad^-2.
+        weight: (n_slopes, n_slopes) W, symmetric: an inverse covariance, rad^-2.
         blind: (n_slopes, n_modes) of full rank.
         kappa: relative to the mean diagonal of ``D^T W D``.
 
     Returns:
         (n_commands, n_slopes)
     """
-    weighted = weight[:, None] * D
+    weighted = weight @ D
     if blind.shape[1]:
-        heavy = weight[:, None] * blind
+        heavy = weight @ blind
         weighted -= heavy @ np.linalg.solve(blind.T @ heavy, blind.T @ weighted)
     normal = D.T @ weighted
     normal[np.diag_indices_from(normal)] += kappa * normal.trace() / len(normal)

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import sparse
 from scipy.linalg import cho_factor, cho_solve, eigh
 
 from srtomo_core.layout import Layout, MirrorLayout
@@ -28,7 +29,7 @@ from srtomo_srtc.estimator import commands_from
 from srtomo_srtc.fitting import KAPPA, Fit, View
 from srtomo_srtc.geometry import Footprints
 from srtomo_srtc.mirrors import influence, interaction_matrix
-from srtomo_srtc.model import blind_modes, layout_of, noise_prior, sightlines
+from srtomo_srtc.model import blind_modes, layout_of, noise_covariance, sightlines
 from srtomo_srtc.provenance import Stages, reconstructor_of
 from srtomo_srtc.split import Split
 
@@ -112,7 +113,7 @@ def modal(
     stages.enter("modes", 0.1)
     layers = (_layer_modes(mirror, layer, profile, sensors, targets, kept) for layer, mirror in enumerate(mirrors))
     R = reconstruct(
-        layers, noise_prior(system, layout, gain), layout.n_commands, blind_modes(system, layout), fit, parts
+        layers, noise_covariance(system, layout, gain), layout.n_commands, blind_modes(system, layout), fit, parts
     )
     return reconstructor_of(
         system,
@@ -130,16 +131,21 @@ def modal(
 
 
 def reconstruct(
-    layers: Iterable[LayerModes], noise: Array, n_commands: int, blind: Array, fit: Fit, split: Split | None = None
+    layers: Iterable[LayerModes],
+    noise: sparse.csr_array,
+    n_commands: int,
+    blind: Array,
+    fit: Fit,
+    split: Split | None = None,
 ) -> Array:
     """R (n_commands, n_slopes) from the modes of all layers.
 
     Args:
-        noise: (n_slopes,) variances, rad^2.
+        noise: (n_slopes, n_slopes) Sigma_nn, rad^2.
         blind: (n_slopes, n) orthonormal slope vectors to be left out.
     """
-    S = np.diag(noise)
-    right = np.zeros((len(noise), n_commands))
+    S = noise.toarray()
+    right = np.zeros((len(S), n_commands))
     for layer in layers:
         weighted = layer.slopes * layer.variances
         S += weighted @ layer.slopes.T

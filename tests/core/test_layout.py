@@ -147,6 +147,7 @@ MATTERS = {
     "mirrors.0.pitch": 0.41,
     "mirrors.0.coupling": 0.31,
     "mirrors.0.margin": 1.5,
+    "mirrors.0.grid": "hexagonal",
 }
 """What slopes and commands depend on, with another value."""
 
@@ -165,6 +166,7 @@ DOES_NOT_MATTER = {
     "sensors.0.read_noise": 3.0,
     "sensors.0.pixels": 8,
     "sensors.0.pixel_scale": 1e-6,
+    "sensors.0.noise_covariance": "noise.npz",
     "mirrors.0.name": "other",
     "mirrors.0.stroke": 5e-6,
     "science.wavelength": 1e-6,
@@ -180,7 +182,7 @@ DOES_NOT_MATTER = {
 
 ELONGATED = {"guide_stars.0.launch": (4.0, 0.0), "guide_stars.0.sodium_thickness": 1e4}
 
-SPECIAL = ("guide_stars.0.name", "guide_stars.0.kind", *ELONGATED)  # change together with others
+SPECIAL = ("guide_stars.0.name", "guide_stars.0.kind", "mirrors.0.influence", *ELONGATED)  # have tests of their own
 
 
 def keys_of(node, path="") -> set[str]:
@@ -218,6 +220,41 @@ def test_the_fingerprint_does_not_change_with_anything_else(key):
 def test_the_fingerprint_does_not_change_with_the_spots():
     system = load_system("mini")
     assert fingerprint(system.with_changes(ELONGATED)) == fingerprint(system)
+
+
+def test_the_fingerprint_knows_influence_functions_by_what_they_are(tmp_path):
+    functions = np.pad(np.ones((1, 1)), 3)
+    np.savez(tmp_path / "a.npz", step=0.1, functions=functions)
+    np.savez(tmp_path / "b.npz", step=0.1, functions=functions[None])
+    np.savez(tmp_path / "c.npz", step=0.1, functions=1.01 * functions)
+    np.savez(tmp_path / "d.npz", step=0.11, functions=functions)
+    a, b, c, d = (fingerprint(load_system("mini", {"mirrors.0.influence": str(tmp_path / f"{n}.npz")})) for n in "abcd")
+    assert a == b and len({a, c, d, fingerprint(load_system("mini"))}) == 4
+
+
+def test_fingerprints_of_instruments_with_square_gaussian_mirrors_stay():
+    """Bags and reconstructors on disk depend on it."""
+    assert fingerprint(load_system("mini")).hex().startswith("536a7be36c9d6c8e")
+
+
+def test_a_hexagonal_mirror_is_of_equilateral_triangles():
+    mirror = Layout(load_system("mini", {"mirrors.0.grid": "hexagonal"})).mirrors[0]
+    distance = np.hypot(*(mirror.actuators[:, None, i] - mirror.actuators[None, :, i] for i in range(2)))
+    neighbours = np.abs(distance - mirror.pitch) < 1e-9
+    assert neighbours.sum(axis=1).max() == 6
+    assert np.all(neighbours.sum(axis=1)[np.hypot(*mirror.actuators.T) < 1.5] == 6)
+    assert distance[distance > 0].min() == pytest.approx(mirror.pitch)
+    # a point grid turned by 60 degrees is itself
+    c, s = math.cos(math.pi / 3), math.sin(math.pi / 3)
+    turned = mirror.actuators @ np.array([[c, s], [-s, c]])
+    inner = np.hypot(*turned.T) < 1.6
+    there = np.hypot(*(turned[inner][:, None, i] - mirror.actuators[None, :, i] for i in range(2)))
+    assert there.min(axis=1) == pytest.approx(0, abs=1e-9)
+    assert np.hypot(*mirror.actuators.T).max() <= 2.0 + 0.8 * mirror.pitch
+    # its density: one to every half sqrt(3) pitches squared
+    assert mirror.n_actuators == pytest.approx(math.pi * 2.2**2 / (math.sqrt(3) / 2 * mirror.pitch**2), rel=0.1)
+    order = np.lexsort(mirror.actuators.T)
+    assert np.array_equal(order, np.arange(mirror.n_actuators))
 
 
 def test_the_fingerprint_knows_the_order():

@@ -96,6 +96,14 @@ def test_systems_prints_one_in_full(capsys) -> None:
     assert numbers["derived"]["tau0_s"] == pytest.approx(0.314 * 0.12 * np.cos(np.radians(20)) ** 0.6 / vbar)
 
 
+def test_reconstruct_lists_every_method_with_its_keywords(capsys) -> None:
+    assert run("reconstruct", "--help") == 0
+    text = " ".join(capsys.readouterr().out.split("methods, and what --with")[1].split())
+    assert "explicit [noise_gain] kappa=0.0001 prior=exact|laplacian [form=covariance|information] solver=" in text
+    assert "moao target=0 " in text
+    assert "learn_apply [noise_gain] lag=0 kappa=0.0003 split=false least_squares" in text  # and no matrices
+
+
 def test_reconstruct_writes_R_Q_G_and_where_they_come_from(capsys) -> None:
     assert run("reconstruct", "mini", "-o", "mini.npz", "--prior", "ground", "--json", "mini.json") == 0
     reconstructor = Reconstructor.load("mini.npz")

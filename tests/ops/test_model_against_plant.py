@@ -20,7 +20,7 @@ from srtomo_sim.sky import Sky
 from srtomo_sim.turbulence import Screens
 from srtomo_srtc.atmosphere import Profile
 from srtomo_srtc.covariance import Turbulence, slope_covariance
-from srtomo_srtc.model import noise_prior, sightlines
+from srtomo_srtc.model import noise_covariance, sightlines
 
 SEEDS = range(1, 4)
 FRAMES = 400  # a square
@@ -70,7 +70,7 @@ def model(system: System, layout: Layout | None = None, oversampling: int = FINE
     for w in range(3):  # the lasers' sensors
         n, own = layout.sensors[w].n_valid, layout.slopes_of(w)
         P[own, own] -= np.kron(np.eye(2), np.full((n, n), 1 / n))
-    return P @ (S + np.diag(noise_prior(system, layout, 1.0))) @ P
+    return P @ (S + noise_covariance(system, layout, 1.0).toarray()) @ P
 
 
 def whitening(covariance: np.ndarray) -> np.ndarray:

@@ -47,7 +47,8 @@ def test_any_seeing_is_as_if_rebuilt(mini: System, bank: Bank, exponent: float) 
 
 def test_noise_counts_as_seeing(mini: System, bank: Bank) -> None:
     """Without read noise, four times the photons are a quarter of every variance."""
-    quiet = mini.with_changes({"sensors.*.read_noise": 0.0})
+    elongated = {"guide_stars.0.launch": (2.5, 0.0), "guide_stars.0.sodium_thickness": 40e3}
+    quiet = mini.with_changes({"sensors.*.read_noise": 0.0, **elongated})
     brighter = quiet.with_changes({f"sensors.{i}.photons": 4 * s.photons for i, s in enumerate(quiet.sensors)})
     own = Bank.build(quiet, (0.05, 0.4))
     rebuilt = implicit(brighter.with_changes({"atmosphere.r0": 0.14}))[0]

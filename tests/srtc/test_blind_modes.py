@@ -13,7 +13,7 @@ from srtomo_srtc.covariance import Turbulence, slope_covariance
 from srtomo_srtc.estimator import estimator
 from srtomo_srtc.geometry import pupil_grid
 from srtomo_srtc.mirrors import interaction_matrix, mirror_wavefronts
-from srtomo_srtc.model import blind_modes, noise_prior, project, sightlines
+from srtomo_srtc.model import blind_modes, noise_covariance, project, sightlines
 from srtomo_srtc.reconstructors import implicit
 from srtomo_srtc.split import Split, low_order_commands
 
@@ -98,7 +98,7 @@ def test_projection_is_the_limit_of_modes_of_any_size(with_focus: System) -> Non
     layout, profile = Layout(with_focus), Profile.of(with_focus)
     sensors = sightlines(with_focus, layout, profile)
     S = slope_covariance(Turbulence.covering(profile, [s.nodes for s in sensors]), sensors)
-    S[np.diag_indices_from(S)] += noise_prior(with_focus, layout, 0.5)
+    S[np.diag_indices_from(S)] += noise_covariance(with_focus, layout, 0.5).diagonal()
     M = blind_modes(with_focus, layout)
     right = np.random.default_rng(0).standard_normal((len(S), 3))
     limit = np.linalg.solve(S + 1e6 * S.trace() * M @ M.T, right)

@@ -23,7 +23,7 @@ from srtomo_srtc.fitting import Fit
 from srtomo_srtc.geometry import Footprints
 from srtomo_srtc.layer_estimate import covariance_form, information_form
 from srtomo_srtc.layer_prior import exact_covariance, exact_inverse
-from srtomo_srtc.model import blind_modes, noise_prior, sightlines
+from srtomo_srtc.model import blind_modes, noise_covariance, sightlines
 from srtomo_srtc.raytrace import LayerGrid, layer_grids, propagation
 from srtomo_srtc.reconstructors.explicit import explicit
 from srtomo_srtc.reconstructors.implicit import implicit
@@ -62,7 +62,7 @@ def _problem(system: System, step: float) -> Problem:
     grids = layer_grids([points, *(s.nodes for s in sensors)], [step] * len(profile.heights))
     T = [propagation(grids, s.nodes) for s in sensors]
     H = sparse.vstack([s.gradient @ t for s, t in zip(sensors, T)], format="csr")
-    noise, blind = noise_prior(system, layout, 1.0), blind_modes(system, layout)
+    noise, blind = noise_covariance(system, layout, 1.0).diagonal(), blind_modes(system, layout)
     return Problem(profile, sensors, grids, T, H, propagation(grids, points), noise, blind)
 
 
@@ -152,7 +152,7 @@ def test_nodes_at_the_rays_own_intercepts_make_the_explicit_reconstructor_the_im
     targets = list(fit.footprints(profile.heights))
     everyone = [*(s.nodes for s in sensors), *(points for _, points in targets)]
     turbulence = Turbulence.covering(profile, everyone)
-    noise, blind = noise_prior(system, layout, 1.0), blind_modes(system, layout)
+    noise, blind = noise_covariance(system, layout, 1.0).diagonal(), blind_modes(system, layout)
 
     S = slope_covariance(turbulence, sensors)
     S[np.diag_indices_from(S)] += noise

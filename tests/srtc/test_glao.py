@@ -14,7 +14,7 @@ from srtomo_srtc.estimator import commands_from
 from srtomo_srtc.fitting import Fit
 from srtomo_srtc.geometry import pupil_grid
 from srtomo_srtc.mirrors import mirror_wavefronts
-from srtomo_srtc.model import noise_prior, sightlines
+from srtomo_srtc.model import noise_covariance, sightlines
 from srtomo_srtc.reconstructors.glao import glao, over_field
 
 
@@ -42,9 +42,9 @@ def _implicit(system: System) -> np.ndarray:
     sensors, fit = sightlines(system, layout, profile), Fit(system, layout)
     targets = list(fit.footprints(profile.heights))
     turbulence = Turbulence.covering(profile, [*(s.nodes for s in sensors), *(points for _, points in targets)])
-    noise = noise_prior(system, layout, 0.5)
+    noise = noise_covariance(system, layout, 0.5)
     right = sum(slope_wavefront_covariance(turbulence, sensors, p) @ view.projection.T for view, p in targets)
-    S = slope_covariance(turbulence, sensors) + np.diag(noise)
+    S = slope_covariance(turbulence, sensors) + noise.toarray()
     return commands_from(S, right, np.zeros((len(S), 0)), fit.solve, None, noise)
 
 

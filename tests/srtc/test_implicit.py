@@ -16,7 +16,7 @@ from srtomo_srtc.atmosphere import METRES_PER_RADIAN, Profile
 from srtomo_srtc.covariance import Turbulence, slope_covariance, slope_wavefront_covariance, wavefront_covariance
 from srtomo_srtc.geometry import footprints, pupil_grid
 from srtomo_srtc.mirrors import mirror_wavefronts
-from srtomo_srtc.model import ground_prior, noise_prior, sightlines
+from srtomo_srtc.model import ground_prior, noise_covariance, sightlines
 from srtomo_srtc.reconstructors import implicit
 
 Shape = Callable[[np.ndarray, np.ndarray], np.ndarray]
@@ -211,7 +211,7 @@ class Prediction:
         direction = system.science.targets[0].position
         points = footprints(grid.x, grid.y, direction, np.inf, profile.heights)
         turbulence = Turbulence.covering(profile, [points, *(s.nodes for s in sensors)])
-        self.noise = noise_prior(system, layout, system.loop.gain if gain is None else gain)
+        self.noise = noise_covariance(system, layout, system.loop.gain if gain is None else gain).diagonal()
         self.S = slope_covariance(turbulence, sensors)
         root = np.sqrt(grid.weight)
         shapes = np.stack([root, root * grid.x, root * grid.y], axis=1)
@@ -292,7 +292,8 @@ def test_ground_prior_moves_everything_down() -> None:
 
 def test_noise_is_what_the_loop_lets_through(mini: System) -> None:
     layout = Layout(mini)
-    assert noise_prior(mini, layout, 0.5) == pytest.approx(noise_prior(mini, layout, 1.0) / 3)
+    looped, open_loop = (noise_covariance(mini, layout, gain).diagonal() for gain in (0.5, 1.0))
+    assert looped == pytest.approx(open_loop / 3)
     assert np.array_equal(implicit(mini, noise_gain=0.5)[0].R, implicit(mini)[0].R)
     assert not np.array_equal(implicit(mini, noise_gain=1.0)[0].R, implicit(mini)[0].R)
 

@@ -11,11 +11,12 @@ from srtomo_srtc import memory
 from srtomo_srtc.atmosphere import Profile
 from srtomo_srtc.covariance import Turbulence, slope_covariance
 from srtomo_srtc.estimator import estimator
-from srtomo_srtc.model import blind_modes, noise_prior, sightlines
+from srtomo_srtc.model import blind_modes, noise_covariance, noise_whitening, sightlines
 from srtomo_srtc.reconstructors.implicit import implicit
 from srtomo_srtc.reconstructors.iterative import iterative, solver
 from srtomo_srtc.toeplitz import ToeplitzCovariance
 
+ELONGATED = {"guide_stars.0.launch": (2.5, -1.0), "guide_stars.0.sodium_thickness": 50e3}
 TURNED_TOGETHER = {
     **{f"sensors.{i}.rotation": 0.11 for i in range(3)},
     "guide_stars.2.altitude": 90e3,
@@ -65,16 +66,20 @@ def test_sensors_that_are_not_only_shifted_are_refused(shifted: System, change: 
 
 
 def test_iteration_solves_to_its_tolerance(shifted: System) -> None:
+    shifted = shifted.with_changes(ELONGATED)
     layout = Layout(shifted)
-    noise, blind = noise_prior(shifted, layout, 0.5), blind_modes(shifted, layout)
-    right = np.random.default_rng(6).normal(size=(layout.n_slopes, 7)) * noise[:, None] ** 0.5
+    N, blind = noise_covariance(shifted, layout, 0.5).toarray(), blind_modes(shifted, layout)
+    factor = np.linalg.cholesky(N)
+    whitened = np.random.default_rng(6).normal(size=(layout.n_slopes, 7))
+    right = factor @ whitened
     S = _dense(shifted)
-    expected = estimator(S + np.diag(noise), right, blind)
+    expected = estimator(S + N, right, blind)
+    whitening = noise_whitening(shifted, layout, 0.5)
     for tolerance in (1e-4, 1e-8):
-        found = solver(_operator(shifted).product, noise, blind, 40, tolerance=tolerance)(right)
+        found = solver(_operator(shifted).product, whitening, blind, 40, tolerance=tolerance)(right)
         # in standard deviations of the noise the matrix has no eigenvalue below 1: the error is below the residual
-        error = np.linalg.norm((found - expected) * noise[:, None] ** 0.5, axis=0)
-        assert np.all(error < tolerance * np.linalg.norm(right * noise[:, None] ** -0.5, axis=0))
+        error = np.linalg.norm(factor.T @ (found - expected), axis=0)
+        assert np.all(error < tolerance * np.linalg.norm(whitened, axis=0))
 
 
 def test_iterative_is_implicit(shifted: System) -> None:

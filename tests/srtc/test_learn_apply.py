@@ -13,7 +13,7 @@ from srtomo_srtc.covariance import Sightline, Turbulence, slope_covariance
 from srtomo_srtc.estimator import commands_from, estimator
 from srtomo_srtc.fitting import Fit
 from srtomo_srtc.mirrors import interaction_matrix
-from srtomo_srtc.model import blind_modes, noise_prior, project, sightlines
+from srtomo_srtc.model import blind_modes, noise_covariance, project, sightlines
 from srtomo_srtc.reconstructors import implicit
 from srtomo_srtc.reconstructors.learn_apply import learn_apply, slope_cross_covariance, virtual_system
 from srtomo_srtc.wind import sensors_carried, winds
@@ -32,7 +32,7 @@ class Model:
         sensors, others = sightlines(system, self.layout, profile), sightlines(virtual, Layout(virtual), profile)
         later = sensors_carried(others, winds(system), -lag)
         turbulence = Turbulence.covering(profile, [s.nodes for s in [*sensors, *later]])
-        self.S = slope_covariance(turbulence, sensors) + np.diag(noise_prior(system, self.layout, 0.5))
+        self.S = slope_covariance(turbulence, sensors) + noise_covariance(system, self.layout, 0.5).toarray()
         self.cross = slope_cross_covariance(turbulence, sensors, later)
         self.virtual = slope_covariance(turbulence, others)
         self.blind = blind_modes(system, self.layout)
@@ -68,9 +68,9 @@ def test_a_complete_set_of_virtual_slopes_is_the_implicit_estimate(mini: System)
         virtual.append(Sightline(points, differences))
         control.append(fit.solve(view.projection @ integral))
     turbulence = Turbulence.covering(profile, [s.nodes for s in [*sensors, *virtual]])
-    noise = noise_prior(mini, layout, 0.5)
+    noise = noise_covariance(mini, layout, 0.5)
     R = commands_from(
-        slope_covariance(turbulence, sensors) + np.diag(noise),
+        slope_covariance(turbulence, sensors) + noise.toarray(),
         slope_cross_covariance(turbulence, sensors, virtual) @ np.hstack(control).T,
         blind_modes(mini, layout),
         lambda commands: commands,

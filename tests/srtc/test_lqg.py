@@ -14,14 +14,15 @@ from srtomo_srtc.covariance import Turbulence, slope_covariance, slope_wavefront
 from srtomo_srtc.fitting import Fit
 from srtomo_srtc.geometry import Footprints
 from srtomo_srtc.lqg import LayeredModel, Lqg, RiccatiError, kalman_gain, layered_model, riccati
-from srtomo_srtc.model import blind_modes, noise_prior, sightlines
+from srtomo_srtc.model import blind_modes, noise_covariance, sightlines
 
 STEP = 0.6
 
 
 @pytest.fixture(scope="module")
 def mini() -> System:
-    return load_system("mini")
+    """With one elongated star, so that noise is no diagonal."""
+    return load_system("mini", {"guide_stars.0.launch": (2.5, 0.0), "guide_stars.0.sodium_thickness": 40e3})
 
 
 @pytest.fixture(scope="module")
@@ -95,7 +96,7 @@ def _lmmse(system: System) -> np.ndarray:
     grids = lqg._grids([*(s.nodes for s in sensors), *views], STEP)
     everywhere = [Footprints(np.tile(x, (3, 1)), np.tile(y, (3, 1))) for x, y in grids]
     turbulence = Turbulence.covering(profile, [*everywhere, *(s.nodes for s in sensors)])
-    S = slope_covariance(turbulence, sensors) + np.diag(noise_prior(system, layout, gain=1.0))
+    S = slope_covariance(turbulence, sensors) + noise_covariance(system, layout, gain=1.0).toarray()
     blind = blind_modes(system, layout)
     P = np.eye(len(S)) - blind @ blind.T
     columns = []

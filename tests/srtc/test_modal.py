@@ -11,7 +11,7 @@ from srtomo_srtc.atmosphere import Profile, covariance
 from srtomo_srtc.covariance import Turbulence, slope_covariance, slope_wavefront_covariance
 from srtomo_srtc.estimator import commands_from
 from srtomo_srtc.fitting import Fit
-from srtomo_srtc.model import blind_modes, noise_prior, sightlines
+from srtomo_srtc.model import blind_modes, noise_covariance, sightlines
 from srtomo_srtc.reconstructors import implicit
 from srtomo_srtc.reconstructors.modal import LayerModes, karhunen_loeve, modal, reconstruct
 
@@ -55,7 +55,7 @@ def test_a_complete_basis_is_the_zonal_estimate(mini: System) -> None:
     targets = list(fit.footprints(profile.heights))
     points = [*(s.nodes for s in sensors), *(p for _, p in targets)]
     turbulence = Turbulence.covering(profile, points)
-    noise, blind = noise_prior(system, layout, 0.5), blind_modes(system, layout)
+    noise, blind = noise_covariance(system, layout, 0.5), blind_modes(system, layout)
 
     starts = np.cumsum([0] + [p.x.shape[1] for p in points])
     layers = []
@@ -69,7 +69,7 @@ def test_a_complete_basis_is_the_zonal_estimate(mini: System) -> None:
         layers.append(LayerModes(variances, slopes, wavefronts))
     R = reconstruct(layers, noise, layout.n_commands, blind, fit)
 
-    S = slope_covariance(turbulence, sensors) + np.diag(noise)
+    S = slope_covariance(turbulence, sensors) + noise.toarray()
     right = sum(slope_wavefront_covariance(turbulence, sensors, p) @ view.projection.T for view, p in targets)
     zonal = commands_from(S, right, blind, fit.solve, None, noise)
     np.testing.assert_allclose(R, zonal, atol=1e-8 * np.abs(zonal).max())

@@ -1,18 +1,24 @@
 import importlib
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from scipy import sparse
 
 from srtomo_core.layout import Layout
-from srtomo_core.system import load_system
+from srtomo_core.system import System, load_system
 from srtomo_core.units import ARCSEC
 from srtomo_srtc.atmosphere import Profile
 from srtomo_srtc.covariance import Turbulence, slope_covariance
 from srtomo_srtc.crossterms import right_hand_side
 from srtomo_srtc.fitting import Fit
-from srtomo_srtc.model import elongation_prior, noise_prior, sightlines
-from srtomo_srtc.noise import slope_noise, slope_variance
-from srtomo_srtc.reconstructors import implicit
+from srtomo_srtc.geometry import pupil_grid
+from srtomo_srtc.mirrors import mirror_wavefronts
+from srtomo_srtc.model import noise_covariance, noise_whitening, sightlines
+from srtomo_srtc.noise import read_noise, slope_noise, slope_variance
+from srtomo_srtc.predict import Prediction
+from srtomo_srtc.reconstructors import METHODS, implicit
 
 
 @pytest.mark.parametrize("electrons", [186.0, 10.0])
@@ -36,6 +42,14 @@ def test_less_light_is_more_noise() -> None:
 ELONGATED = {f"guide_stars.{i}.launch": place for i, place in enumerate([(2.5, 0.0), (-1.0, 2.2), (0.0, 0.0)])} | {
     f"guide_stars.{i}.sodium_thickness": 10e3 for i in range(3)
 }
+
+SMALL = {
+    **{f"sensors.{i}.rotation": 0.11 for i in range(3)},
+    **{f"sensors.{i}.subapertures": 6 for i in range(3)},
+    "guide_stars.2.altitude": 90e3,
+    "mirrors.0.actuators": 7,
+}
+"""Changes to mini that leave its laser sensors only shifted against each other, as :func:`iterative` needs them."""
 
 
 def test_an_elongated_spot_by_hand() -> None:
@@ -73,12 +87,86 @@ def test_a_rotated_sensor_has_its_noise_along_its_own_axes() -> None:
 def test_the_prior_has_every_block() -> None:
     system = load_system("mini", ELONGATED)
     layout = Layout(system)
-    rows, columns, values = elongation_prior(system, layout, 0.5)
-    assert len(rows) == sum(p.n_valid for p in layout.sensors[:3])
-    assert np.all(rows > columns)
-    variance = noise_prior(system, layout, 0.5)
-    assert np.all(values**2 < variance[rows] * variance[columns])
-    assert not len(elongation_prior(load_system("mini"), layout, 0.5)[0])
+    N = noise_covariance(system, layout, 0.5)
+    assert N.nnz == layout.n_slopes + 2 * sum(place.n_valid for place in layout.sensors[:3])
+    for w, (sensor, place) in enumerate(zip(system.sensors, layout.sensors, strict=True)):
+        own, noise = N[layout.slopes_of(w)][:, layout.slopes_of(w)].toarray(), slope_noise(system, sensor, place)
+        n = place.n_valid
+        np.testing.assert_array_equal(own, own.T)
+        np.testing.assert_allclose(own.diagonal(), noise.variance / 3)
+        np.testing.assert_allclose(own[:n, n:].diagonal(), noise.covariance / 3)
+    assert noise_covariance(load_system("mini"), layout, 0.5).nnz == layout.n_slopes
+
+
+def test_whitening_whitens() -> None:
+    system = load_system("mini", ELONGATED)
+    layout = Layout(system)
+    N, W = noise_covariance(system, layout, 0.5), noise_whitening(system, layout, 0.5)
+    np.testing.assert_allclose((W @ N @ W.T).toarray(), np.eye(layout.n_slopes), atol=1e-12)
+
+
+def with_files(system: System, folder: Path, layout: Layout, N: np.ndarray) -> System:
+    """A system whose sensors' noise was measured to be N."""
+    for w, sensor in enumerate(system.sensors):
+        np.savez(folder / sensor.name, covariance=N[layout.slopes_of(w), layout.slopes_of(w)])
+        system = system.with_changes({f"sensors.{w}.noise_covariance": str(folder / f"{sensor.name}.npz")})
+    return system
+
+
+CASES = [(name, {}) for name in METHODS if name not in ("glao", "iterative")] + [
+    ("iterative", {"tolerance": 1e-10}),
+    ("explicit", {"form": "information"}),
+    ("implicit", {"split": True}),
+]
+
+
+@pytest.mark.parametrize(("method", "keywords"), CASES)
+def test_every_method_sees_all_of_the_noise(method: str, keywords: dict[str, Any], tmp_path: Path) -> None:
+    plain = load_system("mini", SMALL)
+    elongated = plain.with_changes({"guide_stars.0.launch": (2.5, 0.0), "guide_stars.0.sodium_thickness": 80e3})
+    layout = Layout(plain)
+    N = noise_covariance(elongated, layout, 1.0).toarray()
+    modelled = METHODS[method](elongated, **keywords)[0].R[0]
+    size = np.abs(modelled).max()
+    measured = METHODS[method](with_files(plain, tmp_path, layout, N), **keywords)[0].R[0]
+    np.testing.assert_allclose(measured, modelled, atol=1e-6 * size)
+    without = METHODS[method](with_files(plain, tmp_path, layout, np.diag(N.diagonal())), **keywords)[0].R[0]
+    assert np.abs(without - modelled).max() > 1e-3 * size
+
+
+def test_the_prediction_sees_all_of_the_noise() -> None:
+    system = load_system("mini", {**SMALL, "guide_stars.0.launch": (2.5, 0.0), "guide_stars.0.sodium_thickness": 80e3})
+    layout = Layout(system)
+    prediction = Prediction(system, lag=False)
+    R = prediction.best()
+    # the laser's jitter is the same in both
+    round_spots = Prediction(load_system("mini", SMALL), lag=False)
+    added = prediction.budgets(R)[0].noise - round_spots.budgets(R)[0].noise
+    extra = noise_covariance(system, layout, 0.5).toarray() - noise_covariance(load_system("mini", SMALL), layout, 0.5)
+    grid = pupil_grid(system.telescope, layout.mirrors[0].pitch / 2)
+    shapes = mirror_wavefronts(layout, grid.x, grid.y, system.science.targets[0].position)
+    low = np.stack([np.ones_like(grid.x), grid.x, grid.y], axis=1) * np.sqrt(grid.weight)[:, None]
+    shapes = shapes * np.sqrt(grid.weight)[:, None]
+    shapes -= low @ np.linalg.lstsq(low, shapes, rcond=None)[0]
+    assert added == pytest.approx(np.trace(shapes @ R @ extra @ R.T @ shapes.T), rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("content", "problem"),
+    [
+        ({"cov": np.eye(4)}, "expected an .npz file with numbers in 'covariance'"),
+        ({"covariance": np.eye(5)}, r"covariance: expected shape \(4, 4\), got \(5, 5\)"),
+        ({"covariance": np.full((4, 4), np.nan)}, "covariance: expected finite numbers, symmetric"),
+        ({"covariance": np.triu(np.ones((4, 4)))}, "covariance: expected finite numbers, symmetric"),
+        ({"covariance": -np.eye(4)}, "covariance: expected positive definite; are there frames enough\\?"),
+    ],
+)
+def test_a_file_that_is_no_covariance(content: dict[str, np.ndarray], problem: str, tmp_path: Path) -> None:
+    np.savez(tmp_path / "noise.npz", **content)
+    with pytest.raises(ValueError, match=problem):
+        read_noise(str(tmp_path / "noise.npz"), 4)
+    with pytest.raises(ValueError, match="No such file"):
+        read_noise(str(tmp_path / "none.npz"), 4)
 
 
 def test_the_elongated_prior_leaves_less_error(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -88,10 +176,8 @@ def test_the_elongated_prior_leaves_less_error(monkeypatch: pytest.MonkeyPatch) 
     sensors, fit = sightlines(system, layout, profile), Fit(system, layout)
     targets = [points for _, points in fit.footprints(profile.heights)]
     turbulence = Turbulence.covering(profile, [*(s.nodes for s in sensors), *targets])
-    S = slope_covariance(turbulence, sensors) + np.diag(noise_prior(system, layout, 0.5))
-    rows, columns, values = elongation_prior(system, layout, 0.5)
-    S[rows, columns] += values
-    S[columns, rows] += values
+    noise = noise_covariance(system, layout, 0.5)
+    S = slope_covariance(turbulence, sensors) + noise.toarray()
     B = right_hand_side(fit, turbulence, sensors, profile.heights)
 
     def error(R: np.ndarray) -> float:
@@ -101,6 +187,6 @@ def test_the_elongated_prior_leaves_less_error(monkeypatch: pytest.MonkeyPatch) 
     elongated = error(implicit(system)[0].R[0].astype(float))
     with monkeypatch.context() as patch:
         module = importlib.import_module("srtomo_srtc.reconstructors.implicit")  # the function has the same name
-        patch.setattr(module, "elongation_prior", lambda *_: (rows[:0], columns[:0], values[:0]))
+        patch.setattr(module, "noise_covariance", lambda *_: sparse.diags_array(noise.diagonal()).tocsr())
         diagonal = error(implicit(system)[0].R[0].astype(float))
     assert diagonal - elongated > (10e-9) ** 2

@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from scipy import sparse
 
 from srtomo_srtc.solve import SymmetricTiles
 
@@ -31,8 +32,10 @@ def test_arithmetic_before_the_factor(S: np.ndarray) -> None:
     B, U, V = (RNG.standard_normal((len(S), 3)) for _ in range(3))
     np.testing.assert_allclose(tiles.product(B), S @ B, atol=1e-9)
     tiles.add_symmetric(U, V)
-    tiles.add_diagonal(np.arange(len(S)) / 100)
-    np.testing.assert_allclose(tiles.dense(), S + U @ V.T + V @ U.T + np.diag(np.arange(len(S)) / 100), atol=1e-11)
+    beside = np.ones(len(S) - 700)
+    N = sparse.diags_array([np.arange(len(S)) / 100, beside, beside], offsets=[0, 700, -700])
+    tiles.add(N.tocsr())
+    np.testing.assert_allclose(tiles.dense(), S + U @ V.T + V @ U.T + N.toarray(), atol=1e-11)
     M = np.linalg.qr(B)[0]
     projected = SymmetricTiles.of(S)
     projected.project(M, gamma=2.0)
@@ -65,7 +68,7 @@ def test_threads_do_not_change_a_bit(S: np.ndarray) -> None:
 
 def test_an_indefinite_matrix_is_refused(S: np.ndarray) -> None:
     tiles = SymmetricTiles.of(S)
-    tiles.add_diagonal(np.where(np.arange(len(S)) == 900, -100.0, 0.0))
+    tiles.add(sparse.csr_array(np.diag(np.where(np.arange(len(S)) == 900, -100.0, 0.0))))
     with pytest.raises(np.linalg.LinAlgError, match="not positive definite: row 900"):
         tiles.factor()
 
