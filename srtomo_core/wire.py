@@ -234,21 +234,31 @@ class _Writer:
 
 
 class SlopeFrameWriter(_Writer):
-    """Writes the SlopeFrames of one sensor, or of several adjacent ones. Put the slopes into ``values``."""
+    """Writes the SlopeFrames of one sensor, of several adjacent ones, or one packet of a sensor again and again.
+
+    Put the slopes into ``values``.
+    """
 
     def __init__(
-        self, name: str, session: int, fingerprint: bytes, sensor: int, n_sensors: int, n_subapertures: int
+        self,
+        name: str,
+        session: int,
+        fingerprint: bytes,
+        sensor: int,
+        n_sensors: int,
+        n_subapertures: int,
+        first_subaperture: int = 0,
     ) -> None:
         super().__init__(name, _SLOPES, 2 * n_subapertures)
-        self._fixed = (session, fingerprint, sensor, n_sensors, n_subapertures)
+        self._fixed = (session, fingerprint, sensor, n_sensors, first_subaperture, n_subapertures)
 
     def write(
         self, stamp_ns: int, frame: int, mirror_frame: int, mirror_frame_before: int, mirror_fraction: float
     ) -> bytes:
         """The serialised message with the slopes now in ``values``. ``stamp_ns``: end of the exposure, UTC, ns."""
-        session, fingerprint, sensor, n_sensors, n_sub = self._fixed
+        session, fingerprint, sensor, n_sensors, first, n_sub = self._fixed
         _STAMP.pack_into(self.buffer, 4, *divmod(stamp_ns, 1_000_000_000))
-        _SLOPES.pack_into(self.buffer, self._start, session, frame, fingerprint, sensor, n_sensors, 0, n_sub,
+        _SLOPES.pack_into(self.buffer, self._start, session, frame, fingerprint, sensor, n_sensors, first, n_sub,
                           mirror_frame, mirror_frame_before, mirror_fraction, 2 * n_sub)  # fmt: skip
         return bytes(self.buffer)
 

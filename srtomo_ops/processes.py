@@ -26,12 +26,12 @@ class Processes:
         self._folder = folder
         self._running: dict[str, subprocess.Popen[bytes]] = {}
 
-    def start(self, name: str, words: list[str]) -> None:
-        """Start ``srtomo WORDS...`` under a name."""
+    def start(self, name: str, words: list[str], module: str = "srtomo_ops.cli") -> None:
+        """Start ``srtomo WORDS...`` under a name, or another module with these words."""
         with open(self.log(name), "wb") as log:
             # a session of its own: Ctrl-C goes to the supervisor, which ends the nodes in order
             self._running[name] = subprocess.Popen(
-                [sys.executable, "-m", "srtomo_ops.cli", *words],
+                [sys.executable, "-m", module, *words],
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=subprocess.STDOUT,

@@ -4,32 +4,60 @@ from __future__ import annotations
 
 import argparse
 import os
+import tempfile
+from pathlib import Path
+from typing import TYPE_CHECKING
 
+from srtomo_core.reconstructor import Reconstructor
+from srtomo_ops.bench import latency
+from srtomo_ops.bench.latency_report import numbers, report
 from srtomo_ops.bench.reconstruct import measure
-from srtomo_ops.options import add_json, add_system, system_of, write_json
+from srtomo_ops.options import add_json, add_system, changes_of, system_of, write_json
 from srtomo_ops.progress import Progress
+
+if TYPE_CHECKING:
+    from srtomo_ops.bench.path import Paths
 
 EXAMPLE = """examples:
   srtomo bench reconstruct gnao_ltao_sr
-  srtomo bench reconstruct mavis --threads 2 --json mavis.json"""
+  srtomo bench reconstruct mavis --threads 2 --json mavis.json
+  srtomo bench latency gnao_ltao_sr --json latency.json"""
 
 _GIB = 2**30
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Arguments of the command."""
-    parser.add_argument("what", metavar="WHAT", choices=("reconstruct",), help="reconstruct: build a reconstructor")
+    parser.add_argument(
+        "what",
+        metavar="WHAT",
+        choices=("reconstruct", "latency"),
+        help="reconstruct: build a reconstructor; latency: slopes to command",
+    )
     add_system(parser, default="gnao_ltao_sr")
     cores = len(os.sched_getaffinity(0))
-    parser.add_argument("--threads", type=int, default=cores, help=f"to compute with (default: {cores}, all cores)")
-    parser.add_argument(
+    build = parser.add_argument_group("reconstruct")
+    build.add_argument("--threads", type=int, default=cores, help=f"to compute with (default: {cores}, all cores)")
+    build.add_argument(
         "--exact", action="store_true", help="float64, nothing interpolated (default: as fast as it goes)"
+    )
+    loop = parser.add_argument_group("latency")
+    loop.add_argument("--frames", type=int, default=250, help="of one turn (default: 250)")
+    loop.add_argument("--pairs", type=int, default=10, help="of turns, HRTC and echo, of each arrival (default: 10)")
+    loop.add_argument("--packets", type=int, default=4, help="a sensor and frame when staggered (default: 4)")
+    loop.add_argument("--compute-only", action="store_true", help="without processes, without ROS")
+    loop.add_argument(
+        "--reconstructor", metavar="FILE", type=Path, help="to run (default: least squares, of the same size)"
     )
     add_json(parser)
 
 
 def main(options: argparse.Namespace) -> int:
-    """Run the command."""
+    """Run the command; exit code 1 if a latency is above its target."""
+    return _latency(options) if options.what == "latency" else _reconstruct(options)
+
+
+def _reconstruct(options: argparse.Namespace) -> int:
     if options.threads < 1:
         raise ValueError(f"--threads: expected at least 1, got {options.threads}")
     system = system_of(options)
@@ -64,3 +92,33 @@ def main(options: argparse.Namespace) -> int:
         },
     )
     return 0
+
+
+def _latency(options: argparse.Namespace) -> int:
+    for name, least in (("frames", 5), ("pairs", 2), ("packets", 1)):
+        if getattr(options, name) < least:
+            raise ValueError(f"--{name}: expected at least {least}, got {getattr(options, name)}")
+    if not options.compute_only:
+        import rclpy  # noqa: F401  # before any work: without ROS there is only --compute-only
+    system = system_of(options)
+    given = Reconstructor.load(options.reconstructor) if options.reconstructor else None
+    problem = latency.Problem.of(system, given, options.packets)
+    compute = latency.measure_compute(problem, options.frames * options.pairs)
+    paths = None if options.compute_only else _paths(options, problem)
+    lines, met = report(problem, compute, paths)
+    print("\n".join(lines))
+    write_json(
+        options.json,
+        {"frames_per_turn": options.frames, "pairs": options.pairs, **numbers(problem, compute, paths)},
+    )
+    return 0 if met else 1
+
+
+def _paths(options: argparse.Namespace, problem: latency.Problem) -> Paths:
+    from domain_coordinator import domain_id
+
+    from srtomo_ops.bench.path import measure_paths
+
+    with domain_id() as domain, tempfile.TemporaryDirectory(prefix="srtomo-bench-") as folder:
+        os.environ["ROS_DOMAIN_ID"] = str(domain)
+        return measure_paths(problem, options.system, changes_of(options), options.pairs, options.frames, Path(folder))

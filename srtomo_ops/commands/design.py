@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import time
 from pathlib import Path
 
@@ -29,6 +30,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--evaluations", type=int, default=200, help="of the search, at most (default: 200)")
     parser.add_argument("--seed", type=int, default=1, help="of the search's second start (default: 1)")
     parser.add_argument("--points", type=int, default=7, help="of each cut through the optimum (default: 7)")
+    cores = os.cpu_count() or 1
+    parser.add_argument("--threads", type=int, default=cores, help=f"to compute with (default: {cores}, all cores)")
     parser.add_argument("-o", "--output", metavar="FILE", type=Path, help="write a figure: cuts, cost of misalignment")
     add_json(parser)
 
@@ -40,19 +43,30 @@ def main(options: argparse.Namespace) -> int:
         writable_file(options.output)
     if options.points < 3:
         raise ValueError(f"--points: expected at least 3, got {options.points}")
+    if options.threads < 1:
+        raise ValueError(f"--threads: expected at least 1, got {options.threads}")
     start = time.perf_counter()
+    threads = options.threads
     variables = VARIABLES[options.vary](system)
     with Progress(f"design, {options.vary}") as progress:
-        found = optimise(system, variables, evaluations=options.evaluations, seed=options.seed, progress=progress.share)
+        found = optimise(
+            system,
+            variables,
+            evaluations=options.evaluations,
+            seed=options.seed,
+            threads=threads,
+            progress=progress.share,
+        )
     print(f"{system.name}, {options.vary}: still sky, best reconstructor, nm rms without tip-tilt")
     print(f"  as it is  {found.start_wfe * 1e9:8.2f}")
     print(f"  best      {found.wfe * 1e9:8.2f}   after {found.evaluations} evaluations")
     for variable, value in zip(variables, found.values, strict=True):
         print(f"    {variable.name:<36} {variable.start:+8.3f} -> {value:+8.3f}")
     with Progress("flatness") as progress:
-        lines = cuts(system, variables, found.values, points=options.points, progress=progress.share)
+        lines = cuts(system, variables, found.values, points=options.points, threads=threads, progress=progress.share)
     with Progress("misalignment") as progress:
-        cost = misalignment(changed(system, variables, found.values), _AMOUNTS, progress=progress.share)
+        chosen = changed(system, variables, found.values)
+        cost = misalignment(chosen, _AMOUNTS, threads=threads, progress=progress.share)
     extra = (f"{amount:g}: {(wfe - cost[0]) * 1e9:+.1f} nm" for amount, wfe in zip(_AMOUNTS[1:], cost[1:]))
     print("  sensors off by an unknown shift [sub-aperture]: " + ", ".join(extra))
     if options.output:

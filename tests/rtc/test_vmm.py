@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from srtomo_rtc import loop, vmm
-from srtomo_rtc.vmm import KERNEL, all_finite, multiply
+from srtomo_rtc.vmm import KERNEL, TILE, all_finite, multiply, multiply_int16, multiply_tiled, quantise, tiled
 
 SHAPES = [(1, 1), (3, 5), (4, 8), (5, 7), (94, 101), (286, 101), (313, 128), (101, 733)]
 
@@ -94,7 +94,16 @@ FUSED = re.compile(r"\b(v?fn?m(add|sub)\d*[ps][sd]|fn?m(la|ls|add|sub))\b")  # x
 
 
 @pytest.mark.parametrize(
-    "function", [vmm.multiply, loop._state_on_mirror, loop._prepared, loop._next_state, loop._clip, loop._relax]
+    "function",
+    [
+        vmm.multiply,
+        vmm.multiply_int16,
+        loop._state_on_mirror,
+        loop._prepared,
+        loop._next_state,
+        loop._clip,
+        loop._relax,
+    ],
 )
 def test_no_multiply_add_is_fused(function):
     """A fused one keeps more bits, and not every processor has it: replays would differ between machines."""
@@ -125,3 +134,73 @@ def test_the_kernel_has_a_name():
     columns, vector = problem(9, 5)
     assert KERNEL == "columns-float32-1thread"
     assert np.array_equal(product(columns, vector), rounded_in_order(columns, vector))
+
+
+@pytest.mark.parametrize("shape", [*SHAPES, (9, TILE), (30, 2 * TILE), (30, 2 * TILE + 1), (30, TILE - 1)])
+def test_tiles_give_the_same_bits(shape):
+    columns, vector = problem(*shape)
+    out = np.full(shape[1], np.nan, "f4")
+    multiply_tiled(tiled(columns.T), vector, out)
+    assert np.array_equal(out, product(columns, vector))
+
+
+def test_tiles_are_the_matrix_s_rows():
+    matrix = np.arange(3 * (TILE + 2)).reshape(TILE + 2, 3).astype("f4")
+    tiles = tiled(matrix)
+    assert tiles.shape == (2, 3, TILE) and tiles.flags.c_contiguous and tiles.dtype == np.float32
+    assert np.array_equal(tiles[0].T, matrix[:TILE])
+    assert np.array_equal(tiles[1, :, :2].T, matrix[TILE:]) and not tiles[1, :, 2:].any()
+
+
+def int16_product(matrix, vector):
+    integers, scales = quantise(matrix)
+    out = np.full(len(matrix), np.nan, "f4")
+    multiply_int16(tiled(integers), scales, vector, out)
+    return out
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_int16_against_float64(shape):
+    """Of the quantised matrix to float32's rounding, and of the matrix itself within the stated error."""
+    columns, vector = problem(*shape)
+    matrix = columns.T * np.logspace(-9, 2, shape[1], dtype="f4")[:, None]
+    steps, scales = quantise(matrix)
+    assert steps.dtype == np.int16 and steps.shape == matrix.shape
+    assert np.array_equal(np.abs(steps.astype(int)).max(axis=1), np.full(shape[1], 32767))
+    decoded = steps * scales.astype(float)[:, None]
+    step = scales.astype(float) * (0.5 + 2**-9)
+    assert np.all(np.abs(decoded - matrix) <= step[:, None])
+    found, y = int16_product(matrix, vector), vector.astype(float)
+    rounding = (len(vector) + 1) * 2**-24 * (np.abs(decoded) @ np.abs(y))
+    assert np.all(np.abs(found - decoded @ y) <= rounding)
+    assert np.all(np.abs(found - matrix.astype(float) @ y) <= rounding + step * np.abs(y).sum())
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_int16_bit_for_bit_the_stated_order(shape):
+    columns, vector = problem(*shape)
+    steps, scales = quantise(columns.T)
+    expected = rounded_in_order(steps.T.astype("f4"), vector) * scales
+    assert np.array_equal(int16_product(columns.T, vector), expected)
+
+
+def test_int16_errs_as_uniform_rounding_does():
+    rng = np.random.default_rng(5)
+    matrix = rng.standard_normal((200, 400))
+    vectors = rng.standard_normal((50, 400)).astype("f4")
+    _, scales = quantise(matrix)
+    errors = np.array([int16_product(matrix, y) - matrix @ y for y in vectors]) / scales
+    expected = np.sqrt(np.mean(np.sum(vectors.astype(float) ** 2, axis=1)) / 12)
+    # float32 sums of 400 add a little
+    assert np.sqrt(np.mean(errors**2)) == pytest.approx(expected, rel=0.05)
+
+
+def test_quantise_keeps_zeros_and_refuses_what_it_cannot_hold():
+    matrix = np.zeros((3, 4))
+    matrix[1] = [0, -2, 1, 0]
+    integers, scales = quantise(matrix)
+    assert np.array_equal(integers[1], [0, -32767, 16384, 0]) and scales[1] == np.float32(2 / 32767)
+    assert not integers[[0, 2]].any() and scales[0] == scales[2] == 1
+    for bad in (np.nan, np.inf, 1e-36):
+        with pytest.raises(ValueError, match="matrix: "):
+            quantise(np.full((2, 2), bad))

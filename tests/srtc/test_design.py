@@ -43,7 +43,7 @@ def test_the_best_reconstructor_is_the_one_that_is_built(mini: System) -> None:
     prediction = Prediction(mini, lag=False)
     built = implicit(mini)[0].R[0].astype(float)
     assert np.linalg.norm(prediction.best() - built) < 1e-6 * np.linalg.norm(built)
-    assert best_wfe(mini) == pytest.approx(mean_wfe(prediction.budgets(built)), rel=1e-6)
+    assert best_wfe(mini) == pytest.approx(mean_wfe(prediction.budgets(built)), rel=1e-3)
 
 
 @pytest.mark.parametrize("kind", sorted(VARIABLES))
@@ -88,7 +88,7 @@ def test_two_sensors_want_to_be_interlaced(pair: System) -> None:
 def test_misalignment_costs_quadratically_at_first(mini: System) -> None:
     amounts = (0.0, 0.05, 0.1)
     errors = misalignment(mini, amounts, draws=2)
-    assert errors[0] == pytest.approx(best_wfe(mini))
+    assert errors[0] == pytest.approx(best_wfe(mini), rel=1e-3)
     extra = errors**2 - errors[0] ** 2
     assert extra[2] / extra[1] == pytest.approx(4, rel=0.25)
     assert 0.5e-9 < errors[2] - errors[0] < 5e-9
