@@ -50,40 +50,74 @@ def right_hand_side(
     Returns:
         (n_commands, n_slopes) rad m.
     """
-    shares = _direct(fit, heights)
+    means = fit.grid.weight[:, None]
+    shares = _direct(fit, means, heights)
     if fast:
         step = _GRID_STEP * min(s.seen.lattice.step for s in sensors if s.seen is not None)
-        grids = _LayerGrids(fit, heights, step)
+        grids = _LayerGrids(fit, means, heights, step)
         if not _direct_is_less(shares, grids):
             shares = grids.shares()
-    products = slope_products(turbulence, sensors, shares, fast=fast, threads=threads, progress=progress)
+    return _without_piston(
+        fit, slope_products(turbulence, sensors, shares, fast=fast, threads=threads, progress=progress)
+    )[0]
+
+
+def right_hand_side_and_tilts(
+    fit: Fit,
+    turbulence: Turbulence,
+    sensors: Sequence[Sightline],
+    heights: Array,
+    *,
+    single: bool = False,
+    threads: int = 1,
+    progress: Progress = silent,
+) -> tuple[Array, Array]:
+    """As :func:`right_hand_side`, with the covariance of tip and tilt in each direction with all slopes.
+
+    Never through layer grids: a residual is of first order in the error of B, of second only in that of R.
+
+    Args:
+        single: float32.
+
+    Returns:
+        B (n_commands, n_slopes) rad m; (n_views, 2, n_slopes) rad m, of tip and tilt in m rms.
+    """
+    means = np.column_stack([fit.grid.weight, fit.grid.tilts])
+    shares = _direct(fit, means, heights)
+    right, low = _without_piston(
+        fit, slope_products(turbulence, sensors, shares, fast=single, threads=threads, progress=progress)
+    )
+    return right, low[:, 1:]
+
+
+def _without_piston(fit: Fit, products: Array) -> tuple[Array, Array]:
+    """B, and the means (n_views, n_means, n_slopes), the first of which is piston, from the sums of :func:`_sums`."""
     n_commands = len(fit.normal)
-    for i, view in enumerate(fit.views):
+    low = products[n_commands:].reshape(len(fit.views), -1, products.shape[1])
+    for view, (piston, *_) in zip(fit.views, low, strict=True):
         # in two steps: the outer product of an extremely large telescope is as large as B
         for rows in np.array_split(np.arange(n_commands), math.ceil(n_commands / 512)):
-            products[rows] -= np.multiply.outer(
-                (view.weight * view.pistons[rows]).astype(products.dtype), products[n_commands + i]
-            )
-    return products[:n_commands]
+            products[rows] -= np.multiply.outer((view.weight * view.pistons[rows]).astype(products.dtype), piston)
+    return products[:n_commands], low
 
 
 def _direct_is_less(direct: list[Share], grids: _LayerGrids) -> bool:
     return sum(share.weights.shape[0] for share in direct) <= grids.n_points
 
 
-def _sums(fit: Fit, index: int) -> sparse.csr_array:
-    """(n_points, n_commands + n_views) ``w W N`` of a direction, and W in its own column for its piston."""
+def _sums(fit: Fit, means: Array, index: int) -> sparse.csr_array:
+    """(n_points, n_commands + n_views n_means) ``w W N`` of a direction, and the means in its own columns."""
     view = fit.views[index]
-    mean = sparse.csr_array((np.ones(1), ([0], [index])), shape=(1, len(fit.views)))
-    own = sparse.csr_array(view.light[:, None]) @ mean
+    mine = sparse.csr_array((np.ones(1), ([0], [index])), shape=(1, len(fit.views)))
+    own = sparse.kron(mine, sparse.csr_array(means), format="csr")
     weighted = sparse.csr_array(view.modes * (view.weight * view.light)[:, None])
     return sparse.csr_array(sparse.hstack([weighted, own], format="csr"))
 
 
-def _direct(fit: Fit, heights: Array) -> list[Share]:
+def _direct(fit: Fit, means: Array, heights: Array) -> list[Share]:
     order = _near_each_other(fit.grid.x, fit.grid.y)
     return [
-        Share(slice(None), Footprints(points.x[:, order], points.y[:, order]), _sums(fit, i)[order])
+        Share(slice(None), Footprints(points.x[:, order], points.y[:, order]), _sums(fit, means, i)[order])
         for i, (_, points) in enumerate(fit.footprints(heights))
     ]
 
@@ -101,8 +135,8 @@ class _LayerGrids:
         n_points: on all layers.
     """
 
-    def __init__(self, fit: Fit, heights: Array, step: float) -> None:
-        self._fit, self._step = fit, step
+    def __init__(self, fit: Fit, means: Array, heights: Array, step: float) -> None:
+        self._fit, self._means, self._step = fit, means, step
         self._seen = [points for _, points in fit.footprints(heights)]
         self._grids = [self._grid(l) for l in range(len(heights))]
         # in a circle, as nearly all the light is
@@ -116,7 +150,7 @@ class _LayerGrids:
 
     def shares(self) -> list[Share]:
         """What the fit asks of each layer."""
-        sums = [_sums(self._fit, i) for i in range(len(self._seen))]
+        sums = [_sums(self._fit, self._means, i) for i in range(len(self._seen))]
         return [self._share(l, sums) for l in range(len(self._grids))]
 
     def _share(self, layer: int, sums: list[sparse.csr_array]) -> Share:

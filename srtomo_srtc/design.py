@@ -20,7 +20,8 @@ from scipy.optimize import minimize
 from srtomo_core.layout import Layout
 from srtomo_core.system import System
 from srtomo_srtc.mirrors import interaction_matrix
-from srtomo_srtc.predict import Prediction, mean_wfe
+from srtomo_srtc.reconstructors.implicit import implicit
+from srtomo_srtc.still_sky import best_wfe, wfe_of
 
 Array = NDArray[np.float64]
 Change = Callable[[System, float], dict[str, object]]
@@ -124,12 +125,6 @@ def changed(system: System, variables: Sequence[Variable], values: Sequence[floa
     return system
 
 
-def best_wfe(system: System) -> float:
-    """Of the best reconstructor: rms over the science directions with their weights, tip-tilt removed, m."""
-    prediction = Prediction(system, lag=False)
-    return mean_wfe(prediction.budgets(prediction.best()))
-
-
 class Design(NamedTuple):
     """What a search found.
 
@@ -156,6 +151,7 @@ def optimise(
     *,
     evaluations: int = 200,
     seed: int = 1,
+    threads: int = 1,
     progress: Callable[[float], None] = lambda done: None,
 ) -> Design:
     """Search from where the system is, and from a random place within the bounds, for the least :func:`best_wfe`.
@@ -163,6 +159,7 @@ def optimise(
     Args:
         evaluations: at most; half of them for each start.
         seed: of the random place.
+        threads: to compute with, apart from those of the BLAS library.
         progress: called with the share of the evaluations used, 0 to 1.
 
     Raises:
@@ -174,21 +171,21 @@ def optimise(
     low, high = (np.array([getattr(v, side) for v in variables]) for side in ("low", "high"))
     start = np.clip([v.start for v in variables], low, high)
     made = 0
-    best: tuple[float, Array] = (math.inf, start)
+    leading: tuple[float, Array] = (math.inf, start)
 
     def wfe(values: Array, limit: int) -> float:
-        nonlocal made, best
+        nonlocal made, leading
         if made >= limit:
             raise _Enough
         made += 1
         progress(made / evaluations)
         # what the instrument refuses (a dark sub-aperture, a star in the wrong place) is no design
         try:
-            found = best_wfe(changed(system, variables, values))
+            found = best_wfe(changed(system, variables, values), threads=threads)
         except ValueError:
             return math.inf
-        if found < best[0]:
-            best = found, values.copy()
+        if found < leading[0]:
+            leading = found, values.copy()
         return found
 
     start_wfe = wfe(start, evaluations)
@@ -208,7 +205,7 @@ def optimise(
             )
         except _Enough:
             pass
-    return Design(best[1], best[0], start_wfe, made)
+    return Design(leading[1], leading[0], start_wfe, made)
 
 
 class Cut(NamedTuple):
@@ -226,6 +223,7 @@ def cuts(
     *,
     points: int = 7,
     reach: float = 0.5,
+    threads: int = 1,
     progress: Callable[[float], None] = lambda done: None,
 ) -> list[Cut]:
     """How flat the optimum is: through ``values`` along each variable, ``reach`` of its range to either side."""
@@ -238,7 +236,7 @@ def cuts(
             progress((n + k / points) / len(variables))
             place = np.array(values, dtype=np.float64)
             place[n] = value
-            errors.append(best_wfe(changed(system, variables, place)))
+            errors.append(best_wfe(changed(system, variables, place), threads=threads))
         found.append(Cut(variable, line, np.array(errors)))
     return found
 
@@ -249,6 +247,7 @@ def misalignment(
     *,
     draws: int = _DRAWS,
     seed: int = 1,
+    threads: int = 1,
     progress: Callable[[float], None] = lambda done: None,
 ) -> Array:
     """WFE when the sensors are not where the reconstructor takes them to be.
@@ -259,14 +258,14 @@ def misalignment(
     Args:
         amounts: sub-apertures.
         draws: of directions; the mean of their variances is taken.
+        threads: to compute with, apart from those of the BLAS library.
 
     Returns:
         (n_amounts,) m rms.
     """
-    believed = Prediction(system, lag=False)
-    R = believed.best()
+    reconstructor, G = implicit(system, fast=True, threads=threads)
+    R = reconstructor.R[0].astype(np.float64)
     nominal = Layout(system)
-    G = interaction_matrix(system, nominal)
     angles = np.random.default_rng(seed).uniform(0, 2 * np.pi, (draws, len(nominal.sensors)))
     errors = []
     for k, amount in enumerate(amounts):
@@ -286,7 +285,7 @@ def misalignment(
                 else place
                 for place, angle in zip(nominal.sensors, turn, strict=True)
             )
-            wrong = R @ (G - interaction_matrix(system, layout))
-            squares.append(mean_wfe(Prediction(system, layout, lag=False).budgets(R, wrong)) ** 2)
+            wrong = R @ (G - interaction_matrix(system, layout, threads))
+            squares.append(wfe_of(R, system, layout, wrong, threads=threads) ** 2)
         errors.append(math.sqrt(float(np.mean(squares))))
     return np.array(errors)

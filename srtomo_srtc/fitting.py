@@ -60,6 +60,7 @@ class Fit:
         grid: pupil points and their weights W.
         views: the science directions of any weight.
         normal: (n_commands, n_commands) with kappa in it.
+        ridge: what kappa adds to its diagonal.
     """
 
     def __init__(self, system: System, layout: Layout, kappa: float = KAPPA) -> None:
@@ -81,7 +82,8 @@ class Fit:
             _add_products(modes.indptr, modes.indices, modes.data, view.weight * view.light, self.normal)
             self.normal -= view.weight * np.outer(view.pistons, view.pistons)
             self.views.append(view)
-        self.normal[np.diag_indices_from(self.normal)] += kappa * self.normal.trace() / len(self.normal)
+        self.ridge = kappa * float(self.normal.trace()) / len(self.normal)
+        self.normal[np.diag_indices_from(self.normal)] += self.ridge
         self._factor = cho_factor(self.normal)
 
     def footprints(self, heights: Array) -> Iterator[tuple[View, Footprints]]:

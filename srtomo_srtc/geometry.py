@@ -129,6 +129,17 @@ class PupilGrid:
     y: Array
     weight: Array
 
+    @property
+    def low_orders(self) -> Array:
+        """(n_points, 3) piston, tip and tilt, times the root of the weight: orthonormal."""
+        root = np.sqrt(self.weight)[:, None]
+        return np.asarray(np.linalg.qr(root * np.stack([np.ones_like(self.x), self.x, self.y], axis=1))[0])
+
+    @property
+    def tilts(self) -> Array:
+        """(n_points, 2) weights that turn a wavefront into its tip and tilt, each in units of its rms."""
+        return np.asarray(np.sqrt(self.weight)[:, None] * self.low_orders[:, 1:])
+
 
 def pupil_grid(telescope: Telescope, spacing: float) -> PupilGrid:
     """Cover the pupil with cells of at most ``spacing`` (m), symmetric about its centre."""

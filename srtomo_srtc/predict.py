@@ -223,7 +223,7 @@ class Prediction:
                 later = _lagged(turbulence, sensors, sensors_carried(sensors, velocity, time))
                 self._moving += weight * (later + later.T)
         self._noise = noise_covariance(system, self.layout, system.loop.gain)
-        self._jitter = _jitter(system, self.layout)
+        self._jitter = jitter(system, self.layout)
 
         hidden = _HIDDEN * METRES_PER_RADIAN**2 * (pitch / profile.r0) ** (5 / 3)
         total = sum(target.weight for target in targets)
@@ -305,7 +305,7 @@ def _lagged(turbulence: Turbulence, now: list[Sightline], then: list[Sightline])
     return np.block([[block.T for block in row] for row in rows])
 
 
-def _jitter(system: System, layout: Layout) -> Array:
+def jitter(system: System, layout: Layout) -> Array:
     """(n_slopes, 2 n_stars) what the stars' jitter adds to the slopes of a frame, times the filter's ``g / (2-g)``."""
     out = np.zeros((layout.n_slopes, 2 * len(system.guide_stars)))
     gain = system.loop.gain
@@ -329,7 +329,7 @@ def _over_pupil(
         shapes: (n_points, n_commands) N.
     """
     root = np.sqrt(grid.weight)[:, None]
-    low = np.linalg.qr(root * np.stack([np.ones_like(grid.x), grid.x, grid.y], axis=1))[0]
+    low = grid.low_orders
     tilts = low[:, 1:]
     phase = root * phase * root.T
     shapes = root * shapes

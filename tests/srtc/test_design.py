@@ -8,9 +8,10 @@ import pytest
 from srtomo_core.layout import Layout
 from srtomo_core.system import System, load_system
 from srtomo_srtc import design
-from srtomo_srtc.design import VARIABLES, best_wfe, changed, cuts, misalignment, optimise
+from srtomo_srtc.design import VARIABLES, changed, cuts, misalignment, optimise
 from srtomo_srtc.predict import Prediction, mean_wfe
 from srtomo_srtc.reconstructors.implicit import implicit
+from srtomo_srtc.still_sky import best_wfe
 
 
 @pytest.fixture(scope="module")
