@@ -38,14 +38,7 @@ class Run(NamedTuple):
 def program_of(layout: Layout, reconstructor: Reconstructor, settings: Settings | None = None) -> Program:
     """A program that runs a reconstructor under plain settings."""
     slot = Slot(layout)
-    slot.fill(
-        reconstructor.R[0],
-        reconstructor.Q[0],
-        reconstructor.slope_reference,
-        reconstructor.command_limit,
-        reconstructor.gain,
-        reconstructor.sha256,
-    )
+    slot.fill(reconstructor)
     return Program(slot, settings or plain_settings(layout))
 
 

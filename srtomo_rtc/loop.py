@@ -29,6 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from srtomo_core.layout import Layout
+from srtomo_core.reconstructor import Reconstructor
 from srtomo_core.wire import MIRROR_UNKNOWN
 from srtomo_rtc.vmm import all_finite, multiply
 
@@ -93,20 +94,18 @@ class Slot:
         self.id = 0
         self.sha256 = bytes(32)
 
-    def fill(
-        self, R: Floats, Q: Floats, slope_reference: Floats, command_limit: Floats, gain: float, sha256: bytes
-    ) -> None:
-        """Copy a checked reconstructor in. Not on the loop's thread, and never into a slot in use."""
+    def fill(self, reconstructor: Reconstructor) -> None:
+        """Copy a checked static reconstructor in. Not on the loop's thread, and never into a slot in use."""
         start = 0
         for columns in self.R_columns:
-            np.copyto(columns, R[:, start : start + len(columns)].T)
+            np.copyto(columns, reconstructor.R[0, :, start : start + len(columns)].T)
             start += len(columns)
-        np.copyto(self.Q_columns, Q.T)
-        self.slope_reference[:] = slope_reference
-        self.command_limit[:] = command_limit
-        self.gain = gain
-        self.sha256 = sha256
-        self.id = int.from_bytes(sha256[:8], "big")
+        np.copyto(self.Q_columns, reconstructor.Q[0].T)
+        self.slope_reference[:] = reconstructor.slope_reference
+        self.command_limit[:] = reconstructor.command_limit
+        self.gain = reconstructor.gain
+        self.sha256 = reconstructor.sha256
+        self.id = reconstructor.id
 
 
 class Program:

@@ -238,14 +238,7 @@ def _name(verdict: int) -> str:
 
 def _filled(layout: Layout, reconstructor: Reconstructor) -> Slot:
     slot = Slot(layout)
-    slot.fill(
-        reconstructor.R[0],
-        reconstructor.Q[0],
-        reconstructor.slope_reference,
-        reconstructor.command_limit,
-        reconstructor.gain,
-        reconstructor.sha256,
-    )
+    slot.fill(reconstructor)
     return slot
 
 

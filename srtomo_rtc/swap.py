@@ -303,14 +303,7 @@ class Swap:
         result = check(reconstructor, self._layout, self._G_cal, self._tip_tilt)
         in_use = {id(held.slot) for held in (self.active, self.previous) if held is not None}
         slot = next(slot for slot in self._slots if id(slot) not in in_use)
-        slot.fill(
-            reconstructor.R[0],
-            reconstructor.Q[0],
-            reconstructor.slope_reference,
-            reconstructor.command_limit,
-            reconstructor.gain,
-            reconstructor.sha256,
-        )
+        slot.fill(reconstructor)
         Program(slot, self.settings).warm()
         self.staged = Held(slot, result, reconstructor)
         return self.staged

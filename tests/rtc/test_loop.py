@@ -28,7 +28,7 @@ def reconstructor(R, gain):
 def program(R, gain, settings=None):
     made = reconstructor(R, gain)
     slot = Slot(LAYOUT)
-    slot.fill(made.R[0], made.Q[0], made.slope_reference, made.command_limit, made.gain, made.sha256)
+    slot.fill(made)
     return Program(slot, settings or plain_settings())
 
 

@@ -304,7 +304,7 @@ def test_the_margin_foretells_which_loops_diverge(mini, moved_mirror, helpers, d
     assert largest < 1 or spectral_radius(E) > 1  # the promise
 
     slot = Slot(mini.layout)
-    slot.fill(mini.a.R[0], mini.a.Q[0], mini.a.slope_reference, np.full(101, 1e30), gain, mini.a.sha256)
+    slot.fill(replace(mini.a, command_limit=np.full(101, 1e30), gain=gain))
     loop = Loop(mini.layout, delay)
     loop.post(Program(slot, helpers.plain_settings(mini.layout)))
     loop.request(closed=True)
