@@ -129,12 +129,18 @@ def _multiply_tile(tile: NDArray[Any], vector: Floats, out: Floats, n_rows: int)
         j += 1
 
 
-@numba.njit("void(f4[:,:,::1], f4[::1], f4[::1])", nogil=True, cache=True, fastmath=False, error_model="numpy")
-def multiply_tiled(tiles: Floats, vector: Floats, out: Floats) -> None:
-    """``out = matrix @ vector``, with the bits of :func:`multiply`. Any thread; releases the interpreter.
+@numba.njit(
+    ["void(f4[:,:,::1], f4[::1], f4[::1])", "void(i2[:,:,::1], f4[::1], f4[::1])"],
+    nogil=True,
+    cache=True,
+    fastmath=False,
+    error_model="numpy",
+)
+def multiply_tiled(tiles: NDArray[Any], vector: Floats, out: Floats) -> None:
+    """``out = matrix @ vector``, for float32 with the bits of :func:`multiply`. Any thread; releases the interpreter.
 
     Args:
-        tiles: of the matrix, as :func:`tiled` makes them.
+        tiles: of the matrix, float32 or int16, as :func:`tiled` makes them.
         vector: (n_columns,).
         out: (n_rows,), overwritten.
     """
@@ -157,14 +163,8 @@ def multiply_int16(tiles: Int16s, scales: Floats, vector: Floats, out: Floats) -
         vector: (n_columns,).
         out: (n_rows,), overwritten.
     """
-    n_rows = len(out)
-    for t in range(len(tiles)):
-        start = t * TILE
-        if start + TILE <= n_rows:
-            _multiply_tile(tiles[t], vector, out[start : start + TILE], TILE)
-        else:
-            _multiply_tile(tiles[t], vector, out[start:], n_rows - start)
-    for i in range(n_rows):
+    multiply_tiled(tiles, vector, out)
+    for i in range(len(out)):
         out[i] *= scales[i]
 
 
