@@ -286,6 +286,8 @@ class Recorder:
             "seconds": time.monotonic() - self._started,
             "cpu_seconds": time.process_time(),
             "bytes": self._bag.bytes_written,
+            "removed_files": self._bag.removed_files,
+            "removed_bytes": self._bag.removed_bytes,
             "messages": sum(tap.recorded for tap in self._taps),
             "frames": self.ledger.frames,
             "lost": sum(count or 0 for count in lost.values()),
@@ -319,6 +321,9 @@ def table(report: dict[str, Any]) -> str:
         f"{report['frames']} whole frames, {report['lost']} messages lost, {report['bytes'] / 1e6:.1f} MB "
         f"in {report['seconds']:.1f} s: {report['bag']}"
     )
+    if report["removed_files"]:
+        removed = f"the oldest {report['removed_files']} files, {report['removed_bytes'] / 1e6:.1f} MB"
+        lines.append(f"{removed}, were removed to stay within the limit")
     if report["malformed"]:
         lines.append(f"{report['malformed']} malformed messages were recorded as they came")
     if report["of_another_instrument"]:
@@ -348,6 +353,8 @@ def run(
     namespace: str = "",
     topics: Sequence[str] | None = None,
     ros_args: Sequence[str] = (),
+    split_bytes: int | None = None,
+    limit_bytes: int | None = None,
 ) -> dict[str, Any]:
     """Record until SIGINT or SIGTERM. Main thread only.
 
@@ -357,6 +364,7 @@ def run(
         namespace: of its topics.
         topics: their names as in ``wire.TOPICS``; all by default.
         ros_args: for rclpy, from ``--ros-args`` on.
+        split_bytes, limit_bytes: of the bag, as in :class:`~srtomo_core.bag.BagWriter`.
 
     Returns:
         :meth:`Recorder.report`.
@@ -373,7 +381,10 @@ def run(
         "n_commands": str(layout.n_commands),
         "created": datetime.now(timezone.utc).isoformat(timespec="seconds"),
     }
-    with _stop_signals() as stop, BagWriter(output, metadata) as bag:
+    with (
+        _stop_signals() as stop,
+        BagWriter(output, metadata, split_bytes=split_bytes, limit_bytes=limit_bytes) as bag,
+    ):
         rclpy.init(args=list(ros_args), signal_handler_options=SignalHandlerOptions.NO)
         try:
             recorder = Recorder(bag, layout, system.loop.rate, namespace, chosen)

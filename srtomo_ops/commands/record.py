@@ -16,6 +16,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-o", "--output", metavar="BAG", type=Path, required=True, help="directory to make")
     parser.add_argument("--namespace", default="", help="of the topics (default: none)")
     parser.add_argument("--topics", metavar="NAME", nargs="+", help="only these, e.g. wfs/slopes (default: all)")
+    parser.add_argument("--split", metavar="MB", type=float, help="begin a new file at this size")
+    parser.add_argument(
+        "--limit", metavar="MB", type=float, help="remove the oldest files beyond this size; needs --split"
+    )
     add_json(parser)
 
 
@@ -24,7 +28,15 @@ def main(options: argparse.Namespace) -> int:
     system = system_of(options)
     from srtomo_rtc.recorder_node import run, table
 
-    report = run(options.output, system, namespace=options.namespace, topics=options.topics)
+    split, limit = (None if size is None else int(size * 1e6) for size in (options.split, options.limit))
+    report = run(
+        options.output,
+        system,
+        namespace=options.namespace,
+        topics=options.topics,
+        split_bytes=split,
+        limit_bytes=limit,
+    )
     print(table(report))
     write_json(options.json, report)
     return 1 if report["lost"] else 0

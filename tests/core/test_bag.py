@@ -290,7 +290,7 @@ def test_what_is_no_bag_is_refused_in_one_line(tmp_path):
     (tmp_path / "empty").mkdir()
     for path, news in (
         ("text.mcap", "not an MCAP file"),
-        ("empty", "one .mcap file, got 0"),
+        ("empty", "expected a directory with .mcap files, got none"),
         ("nowhere", "No such file"),
     ):
         with pytest.raises(BagError, match=news) as caught:
@@ -338,3 +338,78 @@ def test_a_full_disk_leaves_what_was_written(tmp_path, small_chunks, file_size_l
         assert reader.cut is not None
         frames = [wire.read_slope_frame(m.data).frame for m in reader]
     assert frames == list(range(len(frames))) and len(frames) > 100
+
+
+def write_split(path: Path, frames: int, **limits: int) -> BagWriter:
+    """Slopes, flushed every 20 frames, and an event that begins every 50."""
+    with BagWriter(path, {"system": "{}"}, **limits) as writer:
+        writer.declare(SLOPES, wire.SLOPES.type, depth=500)
+        writer.declare(EVENTS, wire.EVENT.type, depth=2, transient_local=True)
+        for frame in range(frames):
+            time = START + frame * 2_000_000
+            if frame % 50 == 0:
+                writer.write(EVENTS, wire.EVENT.type, event(f"at {frame}"), time - 1, time)
+            writer.write(SLOPES, wire.SLOPES.type, slope_frame(frame), time, time, frame + 1)
+            if frame % 20 == 19:
+                writer.flush()
+    return writer
+
+
+def frames_of(path: Path) -> list[int]:
+    with BagReader(path) as reader:
+        assert reader.cut is None
+        return [wire.read_slope_frame(m.data).frame for m in reader.messages(SLOPES)]
+
+
+def test_a_split_bag_reads_as_one(tmp_path, small_chunks):
+    path = tmp_path / "night"
+    write_split(path, 500, split_bytes=20_000)
+    files = sorted(path.glob("*.mcap"))
+    assert len(files) > 4 and all(20_000 <= file.stat().st_size < 40_000 for file in files[:-1])
+    assert frames_of(path) == list(range(500))
+    write_split(tmp_path / "one", 500)
+    with BagReader(path) as split, BagReader(tmp_path / "one") as one:
+        assert list(split) == list(one)
+        assert (split.counts, split.time_range, split.metadata) == (one.counts, one.time_range, one.metadata)
+    with AnyReader([path]) as theirs:  # which is also shown what every file repeats for late readers
+        found = [bytes(data) for connection, _, data in theirs.messages() if connection.topic == SLOPES]
+    assert found == [slope_frame(frame) for frame in range(500)]
+
+
+def test_a_limit_removes_the_oldest_and_leaves_what_a_late_reader_needs(tmp_path, small_chunks):
+    path = tmp_path / "night"
+    writer = write_split(path, 1000, split_bytes=20_000, limit_bytes=100_000)
+    files = sorted(path.glob("*.mcap"))
+    assert sum(file.stat().st_size for file in files) <= 100_000
+    assert writer.removed_files > 5 and not (path / "night_0.mcap").exists()
+    frames = frames_of(path)
+    assert frames == list(range(frames[0], 1000)) and len(frames) > 100
+    with BagReader(path) as reader:
+        texts = [typestore().deserialize_cdr(m.data, m.type).text for m in reader.messages(EVENTS)]
+    before = (frames[0] - 1) // 50 * 50
+    assert texts == [f"at {frame}" for frame in range(before - 50, 1000, 50)]
+    information = yaml.safe_load((path / "metadata.yaml").read_text())["rosbag2_bagfile_information"]
+    assert sorted(information["relative_file_paths"]) == [file.name for file in files]
+
+
+def test_a_split_bag_that_was_cut_is_mended_whole(tmp_path, small_chunks):
+    path = tmp_path / "night"
+    write_split(path, 300, split_bytes=20_000)
+    last = max(path.glob("*.mcap"), key=lambda file: int(file.stem.rpartition("_")[2]))
+    last.write_bytes(last.read_bytes()[:-500])
+    with BagReader(path) as reader:
+        assert reader.cut is not None and reader.cut.startswith(last.name)
+        expected = list(reader)
+    assert repair(path, tmp_path / "mended") == len(expected)
+    with BagReader(tmp_path / "mended") as reader:
+        assert list(reader) == expected
+
+
+def test_a_limit_below_two_files_is_refused(tmp_path):
+    with pytest.raises(ValueError, match="at least two files"):
+        BagWriter(tmp_path / "night", {}, split_bytes=100, limit_bytes=150)
+    with pytest.raises(ValueError, match="expected files to be split"):
+        BagWriter(tmp_path / "night", {}, limit_bytes=150)
+    with pytest.raises(ValueError, match="expected a size above 0"):
+        BagWriter(tmp_path / "night", {}, split_bytes=0)
+    assert not (tmp_path / "night").exists()

@@ -193,6 +193,25 @@ def test_a_chosen_topic_and_a_polite_end(instrument, start_process, tmp_path):
         assert reader.counts == {"/test/hrtc/event": 1}
 
 
+def test_a_long_recording_is_split_and_keeps_to_its_limit(instrument, start_process, tmp_path):
+    arguments = ("record", "mini", "-o", tmp_path / "bag", "--namespace", "test", "--split", "0.1", "--limit", "1.2")
+    recorder = start_process("-m", "srtomo_ops.cli", *arguments, "--json", tmp_path / "report.json")
+    instrument.wait_for_recorder()
+    instrument.adopt(0)
+    instrument.run(range(4000))
+    assert recorder.interrupt() == 0, recorder.output
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert (report["frames"], report["lost"]) == (4000, 0)
+    assert report["removed_files"] > 0 and "removed to stay within the limit" in recorder.output
+    assert sum(file.stat().st_size for file in (tmp_path / "bag").glob("*.mcap")) < 1.2e6
+    with BagReader(tmp_path / "bag") as reader:
+        assert reader.cut is None
+        assert reader.counts["/test/hrtc/event"] == 1  # of frame 0: a replay needs it
+        messages = list(reader.messages(reader.topic(wire.COMMAND.name)))
+        frames = [wire.read_dm_command(message.data).frame for message in messages]
+        assert frames == list(range(frames[0], 4000)) and len(frames) > 500
+
+
 def test_a_publisher_that_offers_too_little_is_reported(instrument, start_recorder, tmp_path):
     recorder = start_recorder()
     qos = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
