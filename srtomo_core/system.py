@@ -150,8 +150,10 @@ class Sensor(_Frozen):
 
     Its lenslets are rotated about the pupil's centre, then moved by +shift (paper, eq. 33-34). ``photons`` are detected
     electrons per area of pupil and time; ``excess_noise`` multiplies the photon noise's standard deviation.
-    ``noise_covariance`` is a file with what was measured, for estimators to suppose in place of all that: ``.npz`` with
-    ``covariance`` (n_slopes, n_slopes), rad^2, of one frame.
+    ``field_stop`` is the side of the square, along the sensor's axes, beyond which no light of a spot arrives; without
+    it spots are whole however long they are. Slopes are calibrated for what it does to a centre of gravity.
+    ``noise_covariance`` is a file with what was measured, for estimators to suppose and the simulated sensor to have in
+    place of all that: ``.npz`` with ``covariance`` (n_slopes, n_slopes), rad^2, of one frame.
     """
 
     name: Name
@@ -166,6 +168,7 @@ class Sensor(_Frozen):
     read_noise: Annotated[Charge, Field(ge=0)]
     pixels: Annotated[int, Field(ge=2, description="across a sub-aperture")]
     pixel_scale: Annotated[Angle, Field(gt=0)]
+    field_stop: Annotated[Angle, Field(gt=0)] | None = None
     noise_covariance: DataFile | None = None
 
 

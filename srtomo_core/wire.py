@@ -58,8 +58,11 @@ RECONSTRUCTOR_BLOCK = Topic(
     "srtc/reconstructor_block", f"{PACKAGE}/msg/ReconstructorBlock", _BLOCKS, transient_local=True
 )
 PROFILE = Topic("srtc/profile", f"{PACKAGE}/msg/AtmosphereProfile", 4, transient_local=True)
+HEALTH = Topic("srtc/health", f"{PACKAGE}/msg/ModelHealth", 64, transient_local=True)
+TELESCOPE = Topic("telescope/status", f"{PACKAGE}/msg/TelescopeStatus", 4, transient_local=True)
 RECORDER_STATUS = Topic("recorder/status", f"{PACKAGE}/msg/RecorderStatus", 16)
 SIM_STATUS = Topic("sim/status", f"{PACKAGE}/msg/SimStatus", 16)
+SIM_PROFILE = Topic("sim/profile", f"{PACKAGE}/msg/AtmosphereProfile", 4, transient_local=True)
 DIAGNOSTICS = Topic("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray", 16)
 
 TOPICS = (
@@ -71,8 +74,11 @@ TOPICS = (
     RECONSTRUCTOR,
     RECONSTRUCTOR_BLOCK,
     PROFILE,
+    HEALTH,
+    TELESCOPE,
     RECORDER_STATUS,
     SIM_STATUS,
+    SIM_PROFILE,
     DIAGNOSTICS,
 )
 """Every topic; all reliable, keep last. Names are relative to the instrument's namespace, but for /diagnostics."""

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from msgs_schema.msg import HrtcStatus, RecorderStatus, SimStatus
-from msgs_schema.srv import PublishReconstructor, SwapReconstructor
+from msgs_schema.srv import ChangeSky, PublishReconstructor, SwapReconstructor
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
@@ -123,6 +124,22 @@ class Operator(Node):
         response = self.call(Trigger, "sim/start", Trigger.Request())
         if not response.success:
             raise OperatorError(f"sim/start: {response.message}")
+
+    def change_sky(self, changes: Mapping[str, str], over: float = 0.0, after: float = 0.0) -> int:
+        """Change the simulated plant while it runs: the first frame that it is in.
+
+        Args:
+            changes: dotted keys of the instrument and their values, with unit.
+            over: s that it takes; after: s until it begins; of the plant's time.
+
+        Raises:
+            OperatorError: refused.
+        """
+        request = ChangeSky.Request(keys=list(changes), values=list(changes.values()), over=over, after=after)
+        response = self.call(ChangeSky, "sim/change", request)
+        if not response.success:
+            raise OperatorError(f"sim/change: {response.message}")
+        return int(response.first_frame)
 
     def publish(self, label: str) -> tuple[int, bytes]:
         """Have the SRTC publish a reconstructor by its label: its id and SHA-256.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +43,53 @@ def assignments(items: list[str], option: str) -> dict[str, Any]:
         except json.JSONDecodeError:
             values[key] = value
     return values
+
+
+def seconds(text: str) -> float:
+    """A time as ``10`` or ``10 s``, for argparse.
+
+    Raises:
+        argparse.ArgumentTypeError: anything else, or less than 0.
+    """
+    try:
+        value = float(text.strip().removesuffix("s"))
+    except ValueError:
+        value = math.nan
+    if not 0 <= value < math.inf:
+        raise argparse.ArgumentTypeError(f"expected a time such as '10 s', got {text!r}")
+    return value
+
+
+def add_schedule(parser: argparse.ArgumentParser) -> None:
+    """``--at TIME KEY=VALUE ...``: what changes in the simulated plant on the way."""
+    parser.add_argument(
+        "--at",
+        metavar=("TIME", "KEY=VALUE"),
+        nargs="+",
+        action="append",
+        default=[],
+        help="change sky, light or a sensor's place on the way; over=TIME lets it take that long: "
+        "--at '2 s' 'atmosphere.r0=10 cm' 'over=5 s'; may be given again",
+    )
+
+
+def schedule_of(options: argparse.Namespace) -> list[dict[str, Any]]:
+    """``--at`` as :func:`srtomo_sim.course.scheduled` takes it.
+
+    Raises:
+        ValueError: not of the form TIME KEY=VALUE.
+    """
+    schedule = []
+    for time, *items in options.at:
+        values = assignments(items, f"--at {time}")
+        try:
+            entry = {"at": seconds(time), "over": seconds(str(values.pop("over", 0))), "set": values}
+        except argparse.ArgumentTypeError as error:
+            raise ValueError(f"--at {time}: {error}") from None
+        if not values:
+            raise ValueError(f"--at {time}: expected KEY=VALUE after it")
+        schedule.append(entry)
+    return schedule
 
 
 def changes_of(options: argparse.Namespace) -> dict[str, Any]:

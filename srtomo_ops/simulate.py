@@ -37,7 +37,7 @@ class Run(NamedTuple):
 
 def program_of(layout: Layout, reconstructor: Reconstructor, settings: Settings | None = None) -> Program:
     """A program that runs a reconstructor under plain settings."""
-    slot = Slot(layout)
+    slot = Slot(layout, reconstructor.n_epochs)
     slot.fill(reconstructor)
     return Program(slot, settings or plain_settings(layout))
 
@@ -69,7 +69,8 @@ def run(
         each: called with every frame's number after it.
     """
     sky = plant.sky
-    loop = Loop(sky.layout, sky.system.loop.delay)
+    epochs = max(program.slot.n_epochs for program in programs.values())
+    loop = Loop(sky.layout, sky.system.loop.delay, epochs)
     loop.post(programs[0])
     loop.prepare()
     loop.request(closed)

@@ -1,7 +1,8 @@
 """The plant as a ROS 2 node: publishes SlopeFrames and obeys DmCommands, at the instrument's rate or in lockstep.
 
 The sky is prepared before the service ``sim/start`` exists. The plant's thread then publishes frame after frame; its
-endpoints are on a node that no executor spins. The executor's thread serves ``sim/start`` and the status.
+endpoints are on a node that no executor spins. The executor's thread serves ``sim/start``, ``sim/change`` and the
+status. A third thread computes the sky anew where a change asks for it; if it cannot keep up, the sky's clock waits.
 """
 
 from __future__ import annotations
@@ -12,8 +13,11 @@ import os
 for _variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ[_variable] = "1"
 
+import copy
+import dataclasses
 import gc
 import json
+import math
 import secrets
 import signal
 import sys
@@ -23,10 +27,12 @@ from collections.abc import Iterable, Sequence
 from types import FrameType
 from typing import Any
 
+import numba
 import numpy as np
 import rclpy
-from msgs_schema.msg import DmCommand, SimStatus
+from msgs_schema.msg import AtmosphereProfile, DmCommand, SimStatus, TelescopeStatus
 from msgs_schema.msg import SlopeFrame as SlopeFrameMsg
+from msgs_schema.srv import ChangeSky
 from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
@@ -36,11 +42,15 @@ from std_srvs.srv import Trigger
 
 from srtomo_core import wire
 from srtomo_core.layout import Layout
-from srtomo_core.system import InstrumentError, load_system
+from srtomo_core.system import InstrumentError, System, load_system
+from srtomo_sim.course import Change, alters_turbulence, scheduled
 from srtomo_sim.plant import Plant
 from srtomo_sim.sky import prepare, strehl
 
 _LOCKSTEP_TIMEOUT = 10.0  # s to wait for a command
+_LEAD = 0.2  # s of the plant's time before a change can begin
+_LEAD_ANEW = 2.0  # the same where the sky has to be computed anew: a start, no more
+_CHUNK = 256  # frames computed anew at first; every next time twice as many, since each has a fixed cost
 
 
 _PARAMETERS: tuple[tuple[str, Any, str], ...] = (
@@ -51,6 +61,7 @@ _PARAMETERS: tuple[tuple[str, Any, str], ...] = (
     ("pace", "wall", "wall: at the instrument's rate; lockstep: a frame when its predecessor is answered"),
     ("combined", False, "one message for all sensors instead of one a sensor"),
     ("science_every", 5, "exposures between two looks at the science directions"),
+    ("schedule", "[]", 'changes on the way as JSON, e.g. [{"at": 5, "over": 2, "set": {"atmosphere.r0": "10 cm"}}], s'),
     ("result", "", "path of an .npz for the WFE of every science exposure; empty: none"),
 )
 
@@ -58,6 +69,14 @@ _PARAMETERS: tuple[tuple[str, Any, str], ...] = (
 def parameters() -> Iterable[tuple[str, Any, str]]:
     """Name, default and description of each parameter; all are read-only."""
     return _PARAMETERS
+
+
+def _value(text: str) -> Any:
+    """As in an instrument file: JSON where it can be, otherwise a quantity with its unit."""
+    try:
+        return json.loads(text)
+    except json.JSONDecodeError:
+        return text
 
 
 class SimNode(Node):
@@ -69,9 +88,17 @@ class SimNode(Node):
             self.declare_parameter(name, default, ParameterDescriptor(description=description, read_only=True))
         self._hot_node = Node("sim_hot")
         self._statuses = self.create_publisher(SimStatus, wire.SIM_STATUS.name, QoSProfile(**wire.SIM_STATUS.qos()))
+        self._truths = self.create_publisher(
+            AtmosphereProfile, wire.SIM_PROFILE.name, QoSProfile(**wire.SIM_PROFILE.qos())
+        )
+        self._telescope = self.create_publisher(
+            TelescopeStatus, wire.TELESCOPE.name, QoSProfile(**wire.TELESCOPE.qos())
+        )
         self._start = threading.Event()
+        self._behind = threading.Event()
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="plant", daemon=True)
+        self._computer = threading.Thread(target=self._compute, name="sky", daemon=True)
         self.failure: str | None = None
 
     def prepare(self) -> None:
@@ -98,7 +125,14 @@ class SimNode(Node):
                 shown = percent
                 print(f"sky {percent} %", flush=True)
 
-        sky = prepare(system, values["frames"], values["seed"], science_every=values["science_every"], progress=show)
+        sky = prepare(
+            system,
+            values["frames"],
+            values["seed"],
+            science_every=values["science_every"],
+            changes=scheduled(json.loads(values["schedule"]), system.loop.rate),
+            progress=show,
+        )
         self._plant = Plant(system, sky)
         self.session = secrets.randbits(63) | 1
         sensors = self._layout.sensors
@@ -129,17 +163,61 @@ class SimNode(Node):
         self._errors: list[tuple[int, list[float], list[float], list[float]]] = []
         self._reported = 0
         self._last_report = (time.monotonic(), -1)
+        self._told: AtmosphereProfile | None = None
         self.create_timer(0.1, self._report)
+        self._report_telescope()
+        self.create_timer(1.0, self._report_telescope)
         gc.collect()
         gc.freeze()
         self._thread.start()
+        self._computer.start()
         self.create_service(Trigger, "sim/start", self._on_start)
+        self.create_service(ChangeSky, "sim/change", self._on_change)
 
     def _on_start(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         response.success = not self._start.is_set()
         response.message = "started" if response.success else "started before"
         self._start.set()
         return response
+
+    def _on_change(self, request: ChangeSky.Request, response: ChangeSky.Response) -> ChangeSky.Response:
+        rate = self._system.loop.rate
+        try:
+            if not request.keys or len(request.keys) != len(request.values):
+                raise InstrumentError("expected as many values as keys, and one at least")
+            values = {key: _value(text) for key, text in zip(request.keys, request.values, strict=True)}
+            change = Change(0, values, round(request.over * rate))
+            soonest = _LEAD_ANEW if alters_turbulence(change) else _LEAD
+            wait = max(request.after, soonest) if self._start.is_set() else request.after
+            change = dataclasses.replace(change, frame=self.frame + 1 + round(wait * rate))
+            if self._plant.change(change):
+                self._behind.set()
+        except (ValueError, OverflowError) as error:
+            response.message = str(error)
+            return response
+        response.success = True
+        response.first_frame = change.frame
+        response.message = f"{', '.join(f'{key} = {values[key]}' for key in values)} from frame {change.frame} on"
+        self.get_logger().info(response.message)
+        return response
+
+    # -- the thread that computes the sky anew ----------------------------------------------------------------------
+
+    def _compute(self) -> None:
+        """Stay ahead of the plant where a change has touched the sky, in what time the other threads leave."""
+        numba.set_num_threads(1)  # of this thread's own
+        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), 19)
+        try:
+            while self._behind.wait() and not self._stop.is_set():
+                self._behind.clear()
+                chunk = _CHUNK
+                while self._plant.ready < self._values["frames"] and not self._stop.is_set():
+                    self._plant.catch_up(chunk)
+                    chunk *= 2
+        except Exception as error:
+            self.failure = f"the sky could not be computed anew: {error}"
+            self.get_logger().fatal(self.failure)
+            self._stop.set()
 
     # -- the plant's thread -----------------------------------------------------------------------------------------
 
@@ -167,6 +245,8 @@ class SimNode(Node):
         for k in range(self._values["frames"]):
             self._sleep_until(start + (k + rest) * period)
             self._drain(start + offset, period)
+            if not self._has_sky(k):
+                return
             slopes = self._plant.measure(k)
             on = self._plant.on_mirror(k)
             self._look(k)
@@ -185,6 +265,8 @@ class SimNode(Node):
 
     def _lockstep(self) -> None:
         for k in range(self._values["frames"]):
+            if not self._has_sky(k):
+                return
             slopes = self._plant.measure(k)
             on = self._plant.on_mirror(k)
             self._look(k)
@@ -196,6 +278,14 @@ class SimNode(Node):
                 if time.monotonic() > end:
                     raise TimeoutError(f"no command for it came in {_LOCKSTEP_TIMEOUT:g} s")
                 time.sleep(0.0001)
+
+    def _has_sky(self, frame: int) -> bool:
+        """Wait for a sky that is being computed anew; False if it need not be waited for any more."""
+        while self._plant.ready <= frame:
+            if self._stop.is_set():
+                return False
+            time.sleep(0.001)
+        return True
 
     def _answered(self, frame: int) -> bool:
         while True:
@@ -234,8 +324,7 @@ class SimNode(Node):
     def _look(self, frame: int) -> None:
         if frame % self._values["science_every"] == 0:
             error = self._plant.wfe(frame)
-            index = frame // self._values["science_every"]
-            uncorrected = [float(np.sqrt(target.power[index])) for target in self._plant.sky.targets]
+            uncorrected = self._plant.sky.uncorrected(frame).tolist()
             self._errors.append((frame, error.high_order.tolist(), error.tip_tilt.tolist(), uncorrected))
 
     def _sleep_until(self, moment: float) -> None:
@@ -270,12 +359,53 @@ class SimNode(Node):
         self._reported += len(recent)
         wavelength = self._system.science.wavelength
         message.wavelength = wavelength
+        truth = self._plant.truth(max(frame, 0))
+        message.changes = sum(change.frame <= frame for change in self._plant.sky.course.changes)
+        message.photons = [sensor.photons for sensor in truth.sensors]
+        sizes = [place.size for place in self._layout.sensors]
+        message.shift_x = [sensor.shift[0] * size for sensor, size in zip(truth.sensors, sizes, strict=True)]
+        message.shift_y = [sensor.shift[1] * size for sensor, size in zip(truth.sensors, sizes, strict=True)]
+        message.rotation = [sensor.rotation for sensor in truth.sensors]
         if recent:
             high_order = np.array([error[1][0] for error in recent])
             message.wfe = float(np.sqrt(np.mean(high_order**2)))
             message.wfe_tip_tilt = float(np.sqrt(np.mean([error[2][0] ** 2 for error in recent])))
             message.strehl = float(strehl(high_order, wavelength).mean())
         self._statuses.publish(message)
+        self._report_truth(truth, max(frame, 0))
+
+    def _report_truth(self, truth: System, frame: int) -> None:
+        """The sky as it is, whenever it is another."""
+        atmosphere = truth.atmosphere
+        message = AtmosphereProfile(
+            source="plant",
+            r0=atmosphere.r0,
+            outer_scale=atmosphere.outer_scale,
+            altitude=[layer.altitude for layer in atmosphere.layers],
+            fraction=list(atmosphere.fractions),
+            wind_speed=[layer.wind_speed for layer in atmosphere.layers],
+            wind_direction=[layer.wind_direction for layer in atmosphere.layers],
+        )
+        if message == self._told:
+            return
+        self._told = copy.deepcopy(message)
+        message.session, message.first_frame = self.session, frame
+        message.header.stamp = self.get_clock().now().to_msg()
+        self._truths.publish(message)
+
+    def _report_telescope(self) -> None:
+        system = self._system
+        lasers = [star.altitude for star in system.guide_stars if star.altitude is not None]
+        message = TelescopeStatus(
+            elevation=math.pi / 2 - system.zenith_angle,
+            sodium_height=lasers[0] if lasers else 0.0,
+            star=[star.name for star in system.guide_stars],
+            star_x=[star.position.x for star in system.guide_stars],
+            star_y=[star.position.y for star in system.guide_stars],
+            star_shutter=[True] * len(system.guide_stars),
+        )
+        message.header.stamp = self.get_clock().now().to_msg()
+        self._telescope.publish(message)
 
     @property
     def finished(self) -> bool:
@@ -286,6 +416,8 @@ class SimNode(Node):
         """End the plant's thread and give the endpoints back."""
         self._stop.set()
         self._start.set()
+        # the other thread holds nothing that would have to be given back
+        self._behind.set()
         if self._thread.is_alive():
             self._thread.join()
         self._hot_node.destroy_node()

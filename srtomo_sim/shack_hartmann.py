@@ -15,13 +15,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from srtomo_core.layout import Array, Layout, SensorLayout, transmission
+from srtomo_core.noise import read_noise
 from srtomo_core.system import Sensor, System, Telescope
+from srtomo_sim.course import travel
 from srtomo_sim.spline import add_weighted_pairs
 from srtomo_sim.turbulence import Screens
 
 _CELL = 0.05  # m, at most, where a sub-aperture is lit in part
 _MAX_CELLS = 40  # across a sub-aperture: larger lenses average over more
 _FINE = 64  # points across a sub-aperture, at least, to see which part of it is lit
+_STOP_POINTS = 80  # across a field stop
 
 
 def lit_fractions(layout: SensorLayout, telescope: Telescope, across: int) -> Array:
@@ -83,17 +86,27 @@ def atmospheric_slopes(
     screens: Screens,
     n_frames: int,
     progress: Callable[[float], None] = lambda done: None,
+    first: int = 0,
 ) -> NDArray[np.float32]:
-    """Slopes of the turbulence alone, averaged over exposures 0 .. n_frames-1: (n_frames, n_slopes), rad.
+    """Slopes of the turbulence alone, averaged over exposures ``first .. first+n_frames-1``: (n_frames, n_slopes), rad.
+
+    r0 is that of exposure 0. In a drift of the wind, what an exposure averages over is that of the mean wind.
 
     Args:
+        screens: with a course that has all these exposures in one stretch.
         progress: called with the share that is done, 0 to 1.
     """
+    frames = np.arange(first, first + n_frames)
+    stretch = screens.course.at(first)
     slopes = np.zeros((n_frames, layout.n_slopes), np.float32)
     parts = [(i, squares) for i, sensor in enumerate(layout.sensors) for squares in cut(sensor, system.telescope)]
     stars = [system.star_of(sensor) for sensor in system.sensors]
+    along = (travel(stretch.before) + travel(stretch.after)) / 2
+    weights = screens.course.weights(frames)
     done = 0
     for l, height in enumerate(screens.heights):
+        if not weights[:, l].any():
+            continue
 
         def filter_of(part: tuple[int, Squares], height: float = height) -> tuple[float, float]:
             i, squares = part
@@ -101,7 +114,7 @@ def atmospheric_slopes(
 
         # sensors that share a filter share its transform
         for averaging, members in groupby(sorted(parts, key=filter_of), filter_of):
-            spline = screens.gradient(l, *averaging)
+            spline = screens.gradient(l, *averaging, along[l])
             for i, squares in members:
                 cone = 1 - height / system.los_range(stars[i])
                 mine, n = layout.slopes_of(i), layout.sensors[i].n_valid
@@ -111,7 +124,8 @@ def atmospheric_slopes(
                     squares.y * cone / screens.grid.step,
                     squares.weight * cone,
                     squares.start,
-                    screens.drift(l, np.arange(n_frames), stars[i].position),
+                    screens.drift(l, frames, stars[i].position),
+                    weights[:, l],
                     squares.subaperture,
                     slopes[:, mine.start : mine.start + n],
                     slopes[:, mine.start + n : mine.stop],
@@ -122,10 +136,11 @@ def atmospheric_slopes(
 
 
 def noise_sigma(system: System, layout: Layout) -> Array:
-    """Standard deviation of each slope's measurement noise: (n_slopes,) rad.
+    """Standard deviation of each slope's measurement noise, unless it was measured: (n_slopes,) rad.
 
     Centre of gravity of N electrons over ``pixels`` x ``pixels``: the spot's rms width along the slope times the excess
-    noise over sqrt(N), and read noise summed over the pixels' squared distances, over N.
+    noise over sqrt(N), and read noise summed over the pixels' squared distances, over N. Behind a field stop, of the
+    electrons that pass, and divided by how far the centre of gravity moves for a spot moved by 1.
     """
     return np.sqrt(np.concatenate([noise[[0, 1], [0, 1]].ravel() for noise in _noise(system, layout)]))
 
@@ -133,6 +148,20 @@ def noise_sigma(system: System, layout: Layout) -> Array:
 def noise_correlation(system: System, layout: Layout) -> list[Array]:
     """Correlation of each sub-aperture's noise in x with that in y, sensor by sensor: (n_valid,), 0 for round spots."""
     return [noise[0, 1] / np.sqrt(noise[0, 0] * noise[1, 1]) for noise in _noise(system, layout)]
+
+
+def measured_noise(system: System, layout: Layout) -> list[tuple[slice, Array]]:
+    """Of each sensor whose noise was measured: its slopes, and the factor (n_slopes, n_slopes) that makes it of white.
+
+    Raises:
+        ValueError: its file cannot be used.
+    """
+    out = []
+    for i, sensor in enumerate(system.sensors):
+        if sensor.noise_covariance is not None:
+            covariance = read_noise(sensor.noise_covariance, layout.sensors[i].n_slopes)
+            out.append((layout.slopes_of(i), np.asarray(np.linalg.cholesky(covariance), np.float64)))
+    return out
 
 
 def _noise(system: System, layout: Layout) -> list[Array]:
@@ -146,8 +175,37 @@ def _noise(system: System, layout: Layout) -> list[Array]:
 def _subaperture_noise(system: System, sensor: Sensor, layout: SensorLayout) -> Array:
     electrons = sensor.photons * layout.size**2 * layout.illumination / system.loop.rate
     pixel = (np.arange(sensor.pixels) - (sensor.pixels - 1) / 2) * sensor.pixel_scale
-    read = sensor.read_noise**2 * sensor.pixels * (pixel**2).sum() / electrons**2
-    return sensor.excess_noise**2 * _spot_covariance(system, sensor, layout) / electrons + read * np.eye(2)[:, :, None]
+    read = sensor.read_noise**2 * sensor.pixels * (pixel**2).sum() * np.eye(2)[:, :, None]
+    spot = _spot_covariance(system, sensor, layout)
+    if sensor.field_stop is None:
+        return sensor.excess_noise**2 * spot / electrons + read / electrons**2
+    passed, left, moves = np.stack([_through_stop(one, sensor.field_stop) for one in np.moveaxis(spot, -1, 0)], axis=-1)
+    electrons = electrons * passed[0, 0]
+    noise = sensor.excess_noise**2 * left / electrons + read / electrons**2
+    calibration = np.linalg.inv(np.moveaxis(moves, -1, 0))
+    return np.einsum("nij,jkn,nlk->iln", calibration, noise, calibration)
+
+
+def _through_stop(spot: Array, side: float) -> Array:
+    """(3, 2, 2) of a Gaussian spot (2, 2) in a square: the share that passes, the second moments of that, and how far
+    its centre of gravity moves for a spot moved by 1, by small moves.
+    """
+    place = side * ((np.arange(_STOP_POINTS) + 0.5) / _STOP_POINTS - 0.5)
+    x, y = np.meshgrid(place, place)
+    inverse = np.linalg.inv(spot)
+
+    def light(dx: float, dy: float) -> Array:
+        u, v = x - dx, y - dy
+        return np.exp(-0.5 * (inverse[0, 0] * u**2 + 2 * inverse[0, 1] * u * v + inverse[1, 1] * v**2))
+
+    def centre(light: Array) -> Array:
+        return np.array([np.vdot(light, x), np.vdot(light, y)]) / light.sum()
+
+    still, step = light(0.0, 0.0), 1e-3 * side
+    everything = 2 * math.pi * math.sqrt(np.linalg.det(spot)) * (_STOP_POINTS / side) ** 2
+    left = [[np.vdot(still, a * b) / still.sum() for b in (x, y)] for a in (x, y)]
+    moves = [(centre(light(*shift)) - centre(light(*-shift))) / (2 * step) for shift in step * np.eye(2)]
+    return np.array([np.full((2, 2), still.sum() / everything), left, np.transpose(moves)])
 
 
 def _spot_covariance(system: System, sensor: Sensor, layout: SensorLayout) -> Array:

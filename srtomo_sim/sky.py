@@ -7,8 +7,8 @@ mirrors' shapes at the pupil, piston and tip-tilt removed from both, ``mean |phi
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from srtomo_core.layout import Array, Layout, transmission
 from srtomo_core.system import Direction, System, Telescope
+from srtomo_sim.course import Change, Course, moved, sensor_places
 from srtomo_sim.mirror import interaction_matrix, mirror_phase
 from srtomo_sim.shack_hartmann import atmospheric_slopes
 from srtomo_sim.spline import add_values
@@ -75,15 +76,33 @@ class ScienceTarget:
         return np.sqrt(np.maximum(self.power - made, 0))
 
 
+class Place(NamedTuple):
+    """Where sensors are from an exposure on.
+
+    Attributes:
+        first: that exposure.
+        interaction: (n_slopes, n_commands) true response of the sensors, rad/m.
+    """
+
+    first: int
+    layout: Layout
+    interaction: NDArray[np.float32]
+
+
 @dataclass(frozen=True, eq=False)
 class Sky:
     """Frames 0 .. n_frames-1 of turbulence for one layout and frame rate. Photons and noise play no part in it.
 
+    Slopes and targets hold r0 as it is in exposure 0; :meth:`turbulence`, :meth:`error` and :meth:`uncorrected` have
+    what the course makes of it.
+
     Attributes:
+        layout, interaction: where the sensors are in exposure 0, and their response there.
         slopes: (n_frames, n_slopes) of the turbulence, rad.
-        interaction: (n_slopes, n_commands) true response of the sensors, rad/m.
         science_every: science directions are known in frames that this divides.
         targets: one a science direction.
+        course: what changes in which frame.
+        moves: where the sensors are from later exposures on.
     """
 
     system: System
@@ -93,11 +112,23 @@ class Sky:
     interaction: NDArray[np.float32]
     science_every: int
     targets: tuple[ScienceTarget, ...]
+    course: Course
+    moves: tuple[Place, ...] = ()
 
     @property
     def n_frames(self) -> int:
         """Number of exposures."""
         return len(self.slopes)
+
+    def turbulence(self, frame: int) -> NDArray[np.float32]:
+        """Slopes of the turbulence in an exposure: (n_slopes,) rad."""
+        return np.float32(self._amplitude(frame)) * self.slopes[frame]
+
+    def place(self, frame: int) -> Place:
+        """Where the sensors are in an exposure."""
+        return next(
+            (place for place in reversed(self.moves) if place.first <= frame), Place(0, self.layout, self.interaction)
+        )
 
     def error(self, frame: int, commands: ArrayLike) -> WavefrontError:
         """Residual at the middle of exposure ``frame`` with ``commands`` (n_commands,) on the mirrors.
@@ -105,12 +136,90 @@ class Sky:
         Raises:
             ValueError: not a science frame.
         """
+        index, amplitude = self._science(frame), self._amplitude(frame)
+        # mean |a phi - N m|^2 is a^2 times that of the shape m / a
+        shape = np.asarray(commands, np.float64) / amplitude
+        squares = amplitude**2 * np.array([target.residual(index, shape) for target in self.targets])
+        return WavefrontError(np.sqrt(squares[:, 0]), np.sqrt(squares[:, 1]))
+
+    def uncorrected(self, frame: int) -> Array:
+        """The turbulence's wavefront at the middle of an exposure, m rms without piston and tip-tilt: (n_targets,).
+
+        Raises:
+            ValueError: not a science frame.
+        """
+        index = self._science(frame)
+        return self._amplitude(frame) * np.sqrt([target.power[index] for target in self.targets])
+
+    def fitting_error(self, target: int = 0) -> Array:
+        """What the mirrors cannot make towards a science direction: (n_science,) m rms, tip-tilt removed."""
+        frames = np.arange(0, self.n_frames, self.science_every)
+        return self.course.amplitude(frames) * self.targets[target].fitting_error()
+
+    def _amplitude(self, frame: int) -> float:
+        return float(self.course.amplitude(np.array([frame]))[0]) if self.course.changes else 1.0
+
+    def _science(self, frame: int) -> int:
         index, rest = divmod(frame, self.science_every)
         if rest or not 0 <= frame < self.n_frames:
             raise ValueError(f"frame: expected a multiple of {self.science_every} below {self.n_frames}, got {frame}")
-        shape = np.asarray(commands, np.float64)
-        squares = np.array([target.residual(index, shape) for target in self.targets])
-        return WavefrontError(np.sqrt(squares[:, 0]), np.sqrt(squares[:, 1]))
+        return index
+
+    def changed(self, change: Change) -> Sky:
+        """This sky with one more change to its course.
+
+        Frames and arrays are shared with this one; unless :func:`~srtomo_sim.course.alters_turbulence` says that they
+        need not, those from the change on have to be computed anew: :meth:`compute`.
+
+        Raises:
+            InstrumentError: the change is refused.
+        """
+        course = self.course.extended(change)
+        return replace(self, course=course, moves=_moves(self.system, self.layout, course))
+
+    def compute(self, screens: Screens, first: int, stop: int, progress: Callable[[float], None]) -> Part:
+        """Frames ``first`` to ``stop - 1`` anew.
+
+        Args:
+            screens: of this system, seed and course.
+        """
+        parts = []
+        for stretch in self.course.between(first, stop):
+            start, end = max(first, stretch.start), min(stop, stretch.stop)
+            parts.append(
+                atmospheric_slopes(
+                    self.system,
+                    self.place(start).layout,
+                    screens,
+                    end - start,
+                    _part_of(progress, 0.8 * (start - first) / (stop - first), 0.8 * (end - start) / (stop - first)),
+                    start,
+                )
+            )
+        slopes = parts[0] if len(parts) == 1 else np.concatenate(parts)
+        science = np.arange(-(-first // self.science_every) * self.science_every, stop, self.science_every)
+        return Part(first, slopes, _science(self.system, self.layout, screens, science, progress))
+
+    def put(self, part: Part) -> None:
+        """Take in what was computed anew."""
+        self.slopes[part.first : part.first + len(part.slopes)] = part.slopes
+        start = -(-part.first // self.science_every)
+        for target, new in zip(self.targets, part.targets, strict=True):
+            rows = slice(start, start + len(new.power))
+            target.power[rows], target.projection[rows], target.tip_tilt[rows] = new.power, new.projection, new.tip_tilt
+
+
+def _part_of(progress: Callable[[float], None], begun: float, share: float) -> Callable[[float], None]:
+    """What a part of the work that takes ``share`` of it, and begins when ``begun`` is done, calls with its own."""
+    return lambda done: progress(begun + share * done)
+
+
+class Part(NamedTuple):
+    """Some frames of a sky from ``first`` on, as in :class:`Sky`."""
+
+    first: int
+    slopes: NDArray[np.float32]
+    targets: tuple[ScienceTarget, ...]
 
 
 def prepare(
@@ -120,6 +229,7 @@ def prepare(
     *,
     layout: Layout | None = None,
     science_every: int = 1,
+    changes: Sequence[Change] = (),
     progress: Callable[[float], None] = lambda done: None,
 ) -> Sky:
     """Let ``n_frames`` exposures of sky pass over an instrument.
@@ -132,18 +242,33 @@ def prepare(
     Args:
         layout: where sensors and actuators truly are; by default where the system says.
         science_every: know the science directions only in every so many frames.
+        changes: of sky, light and sensors, in order of their frames. A layer that is to gain strength has to be there
+            from the beginning, with a fraction of 0.
         progress: called with the share that is done, 0 to 1.
 
     Raises:
         ValueError: the sky does not fit in memory (outer scale, field).
+        InstrumentError: a change is refused.
     """
     layout = layout or Layout(system)
-    screens = Screens(system, seed)
-    slopes = atmospheric_slopes(system, layout, screens, n_frames, lambda done: progress(0.8 * done))
+    course = Course(system, changes)
+    moves = _moves(system, layout, course)
     response = interaction_matrix(system, layout).astype(np.float32)
-    targets = _science(system, layout, screens, np.arange(0, n_frames, science_every), progress)
+    empty = Sky(system, layout, seed, np.zeros((0, 0), np.float32), response, science_every, (), course, moves)
+    part = empty.compute(Screens(system, seed, course), 0, n_frames, progress)
     progress(1.0)
-    return Sky(system, layout, seed, slopes, response, science_every, targets)
+    return replace(empty, slopes=part.slopes, targets=part.targets)
+
+
+def _moves(system: System, layout: Layout, course: Course) -> tuple[Place, ...]:
+    moves: list[Place] = []
+    last = system
+    for stretch in course.stretches:
+        if sensor_places(stretch.after) != sensor_places(last):
+            there = moved(layout, system.telescope, system, stretch.after)
+            moves.append(Place(stretch.start, there, interaction_matrix(system, there).astype(np.float32)))
+            last = stretch.after
+    return tuple(moves)
 
 
 def pupil_points(telescope: Telescope) -> tuple[Array, Array]:
@@ -157,13 +282,17 @@ def pupil_points(telescope: Telescope) -> tuple[Array, Array]:
 def wavefronts(screens: Screens, frames: NDArray[np.integer], x: Array, y: Array, direction: Direction) -> Array:
     """The turbulence's wavefront towards a star at infinity at the middle of exposures: (n_frames, n_points), m.
 
+    r0 is that of exposure 0.
+
     Args:
         x, y: (n_points,) pupil coordinates, m.
     """
     phase = np.zeros((len(frames), len(x)))
-    step = screens.grid.step
+    step, weights = screens.grid.step, screens.course.weights(frames)
     for l, phase_of_layer in enumerate(screens.phases):
-        add_values(phase_of_layer, x / step, y / step, screens.drift(l, frames, direction), phase)
+        if weights[:, l].any():
+            drift = screens.drift(l, frames, direction)
+            add_values(phase_of_layer, x / step, y / step, drift, weights[:, l], phase)
     return phase
 
 

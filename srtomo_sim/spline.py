@@ -78,14 +78,14 @@ def _sum(c, channel, j, i, wy, wx):
     return total * np.float32(1 / 36)
 
 
-@njit(parallel=True, cache=True, fastmath={"contract"})
-def add_values(c, x, y, drift, out):
-    """``out[f, p] += f(x[p] + drift[f, 0], y[p] + drift[f, 1])``.
+@njit(parallel=True, nogil=True, cache=True, fastmath={"contract"})
+def add_values(c, x, y, drift, scale, out):
+    """``out[f, p] += scale[f] f(x[p] + drift[f, 0], y[p] + drift[f, 1])``.
 
     Args:
         c: padded coefficients of one channel.
         x, y: (n_points,) in grid steps, not farther from 0 than the grid's size.
-        drift: (n_frames, 2) in grid steps.
+        drift: (n_frames, 2) in grid steps; scale: (n_frames,).
         out: (n_frames, n_points).
     """
     n = c.shape[0] - _PAD
@@ -94,21 +94,21 @@ def add_values(c, x, y, drift, out):
         for p in range(len(x)):
             i, wx = _locate(x[p] + drift_x, n)
             j, wy = _locate(y[p] + drift_y, n)
-            out[f, p] += _sum(c, 0, j, i, wy, wx)
+            out[f, p] += scale[f] * _sum(c, 0, j, i, wy, wx)
 
 
-@njit(parallel=True, cache=True, fastmath={"contract"})
-def add_weighted_pairs(c, x, y, weight, start, drift, owner, first, second):
+@njit(parallel=True, nogil=True, cache=True, fastmath={"contract"})
+def add_weighted_pairs(c, x, y, weight, start, drift, scale, owner, first, second):
     """Weighted sums of a two-channel surface over groups of points, added to two sets of columns.
 
-    ``first[f, owner[g]] += sum_p weight[p] f_0(x[p] + drift[f, 0], y[p] + drift[f, 1])`` over the points
+    ``first[f, owner[g]] += scale[f] sum_p weight[p] f_0(x[p] + drift[f, 0], y[p] + drift[f, 1])`` over the points
     ``start[g] <= p < start[g+1]``; ``second`` likewise with channel 1.
 
     Args:
         c: padded coefficients of two channels.
         x, y: (n_points,) in grid steps, not farther from 0 than the grid's size; weight: (n_points,).
         start: (n_groups + 1,); owner: (n_groups,) column of each group.
-        drift: (n_frames, 2) in grid steps.
+        drift: (n_frames, 2) in grid steps; scale: (n_frames,).
         first, second: (n_frames, n_columns).
     """
     n = c.shape[0] - _PAD
@@ -122,5 +122,5 @@ def add_weighted_pairs(c, x, y, weight, start, drift, owner, first, second):
                 j, wy = _locate(y[p] + drift_y, n)
                 total_0 += weight[p] * _sum(c, 0, j, i, wy, wx)
                 total_1 += weight[p] * _sum(c, 1, j, i, wy, wx)
-            first[f, owner[g]] += total_0
-            second[f, owner[g]] += total_1
+            first[f, owner[g]] += scale[f] * total_0
+            second[f, owner[g]] += scale[f] * total_1

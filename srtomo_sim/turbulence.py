@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.special import gamma, kv
 
 from srtomo_core.system import Direction, System
+from srtomo_sim.course import Course, travel
 from srtomo_sim.spline import Array, padded, square_sum
 
 METRES_PER_RADIAN = 500e-9 / (2 * math.pi)
@@ -92,19 +93,18 @@ class Screens:
 
     Attributes:
         heights: (n_layers,) along the line of sight, m.
-        travel: (n_layers, 2) how far each layer moves in a frame time, m.
+        travel: (n_layers, 2) how far each layer moves in exposure 0, m.
+        course: how strength and wind change. The screens have the strength of its ``kept_at``.
     """
 
-    def __init__(self, system: System, seed: int) -> None:
-        atmosphere = system.atmosphere
+    def __init__(self, system: System, seed: int, course: Course | None = None) -> None:
         self.grid = grid_for(system)
         self.heights = np.array(system.los_heights)
-        speed = np.array([layer.wind_speed for layer in atmosphere.layers]) / system.loop.rate
-        direction = np.array([layer.wind_direction for layer in atmosphere.layers])
-        self.travel = np.stack([speed * np.cos(direction), speed * np.sin(direction)], axis=1)
-        amplitude = _amplitude(self.grid, system.los_r0, atmosphere.outer_scale)
+        self.travel = travel(system)
+        self.course = course or Course(system)
+        amplitude = _amplitude(self.grid, system.los_r0, system.atmosphere.outer_scale)
         self._spectra = []
-        for l, fraction in enumerate(atmosphere.fractions):
+        for l, fraction in enumerate(self.course.kept_at):
             noise = np.random.default_rng([seed, l]).standard_normal((self.grid.size, self.grid.size))
             spectrum = scipy.fft.rfft2(noise, workers=-1, overwrite_x=True)
             spectrum *= amplitude
@@ -120,19 +120,20 @@ class Screens:
         Exposure k lasts from k to k+1 frame times. The sky at x is the screen at x - v t: the layer goes with the wind.
         """
         offset = self.heights[layer] * np.array([direction.x, direction.y])
-        return (offset - (frames[:, None] + 0.5) * self.travel[layer]) / self.grid.step
+        return (offset - self.course.gone(layer, frames)) / self.grid.step
 
     @cached_property
     def phases(self) -> tuple[NDArray[np.float32], ...]:
         """Each layer's wavefront, m: padded spline coefficients, one channel."""
         return tuple(padded(_real(spectrum)) for spectrum in self._spectra)
 
-    def gradient(self, layer: int, side: float, rotation: float) -> NDArray[np.float32]:
+    def gradient(self, layer: int, side: float, rotation: float, travel: Array | None = None) -> NDArray[np.float32]:
         """The gradient of a layer's wavefront, averaged exactly over a square and over an exposure.
 
         Args:
             side: of the square at the layer, m.
             rotation: of the square, and of the axes along which the gradient is taken, rad.
+            travel: (2,) how far the layer moves in the exposure, m; by default as in exposure 0.
 
         Returns:
             Padded spline coefficients of two channels, along x and y of the turned axes: m of wavefront per m.
@@ -142,8 +143,9 @@ class Screens:
         k = 2 * np.pi * scipy.fft.fftfreq(n, self.grid.step)
         c, s = math.cos(rotation), math.sin(rotation)
         # each row: along x of the square, along y, along the wind; a phase is the sum of one part for kx, one for ky
-        over_x = np.outer([c * side, -s * side, self.travel[layer, 0]], k[: n // 2 + 1]) / 2
-        over_y = np.outer([s * side, c * side, self.travel[layer, 1]], k) / 2
+        along = self.travel[layer] if travel is None else travel
+        over_x = np.outer([c * side, -s * side, along[0]], k[: n // 2 + 1]) / 2
+        over_y = np.outer([s * side, c * side, along[1]], k) / 2
         along_x, along_y = np.empty_like(spectrum), np.empty_like(spectrum)
         _filter_gradient(spectrum, over_x, over_y, 2 / side, along_x, along_y)
         return padded(_real(along_x), _real(along_y))
@@ -154,7 +156,7 @@ def _real(spectrum: NDArray[np.complex64]) -> NDArray[np.float32]:
     return scipy.fft.irfft2(spectrum, s=(n, n), workers=-1)
 
 
-@njit(parallel=True, cache=True)
+@njit(parallel=True, nogil=True, cache=True)
 def _filter_gradient(spectrum, over_x, over_y, scale, along_x, along_y):
     """Multiply by ``i k sinc sinc sinc``; the sincs' arguments are sums over_x[:, i] + over_y[:, j], and k is ``scale``
     times the first two."""

@@ -3,7 +3,17 @@
 A laser star is a column as long as the sodium layer is thick. From a point of the pupil it is seen from the side, the
 more the farther that point is from where the laser leaves: the spot is stretched by ``thickness * distance / range^2``
 along the line to it. Its photon noise is then larger along that line, and x and y of a sub-aperture go together
-(section 3.1.3). The layer is taken to be Gaussian and the spot to fit into the sub-aperture's field.
+(section 3.1.3). The layer is taken to be Gaussian.
+
+A field stop cuts a long spot off. With S the spot's second moments, T those of what is left, and a share of the light
+that passes, a shift of the spot by d moves the centre of gravity by ``T S^-1 d`` only (the derivative of a Gaussian is
+``S^-1`` times itself and the distance). Slopes that are calibrated for this have the noise ::
+
+    S T^-1 (excess^2 T / (share N) + read-out / (share N)^2) T^-1 S
+
+for N electrons: ``excess^2 S / N`` without a stop, and along a spot much longer than the stop next to no information,
+as Bechet et al. (JOSA A 27 (11), A1, 2010) suppose of truncated spots from the start. The bias of a truncated spot
+whose sodium layer changes is no noise, and not in it.
 
 A covariance measured on the sensor itself, from a file, takes the place of all this.
 """
@@ -11,21 +21,23 @@ A covariance measured on the sensor itself, from a file, takes the place of all 
 from __future__ import annotations
 
 import math
-import zipfile
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 from scipy.linalg import solve_triangular
+from scipy.special import ndtr
 
 from srtomo_core.layout import SensorLayout
-from srtomo_core.system import Sensor, System
+from srtomo_core.noise import read_noise
+from srtomo_core.system import GuideStar, Sensor, System
 
 Array = NDArray[np.float64]
 
 _FWHM_PER_SIGMA = 2.355
-_SYMMETRIC = 1e-6  # how far a measured covariance may be from it, of its largest entry
+_TAILS = 8.0  # standard deviations: nothing is beyond
+_NODES = 96  # of the quadrature across a spot
 
 
 class SlopeNoise(NamedTuple):
@@ -78,32 +90,7 @@ def sensor_noise(system: System, sensor: Sensor, layout: SensorLayout) -> SlopeN
     """
     if sensor.noise_covariance is None:
         return slope_noise(system, sensor, layout)
-    return read_noise(sensor.noise_covariance, layout.n_slopes)
-
-
-def read_noise(path: str, n_slopes: int) -> MeasuredNoise:
-    """Read ``covariance`` (n_slopes, n_slopes), rad^2, all x then all y, of one frame, from an ``.npz`` file.
-
-    Raises:
-        ValueError: in one line, what is wrong with it.
-    """
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            covariance = np.asarray(file["covariance"], dtype=np.float64)
-    except OSError as error:
-        raise ValueError(f"{path}: {error.strerror or error}") from None
-    except (KeyError, TypeError, ValueError, zipfile.BadZipFile):
-        raise ValueError(f"{path}: expected an .npz file with numbers in 'covariance'") from None
-    if covariance.shape != (n_slopes, n_slopes):
-        raise ValueError(f"{path}: covariance: expected shape {(n_slopes, n_slopes)}, got {covariance.shape}")
-    if not np.abs(covariance - covariance.T).max() <= _SYMMETRIC * np.abs(covariance).max() < math.inf:
-        raise ValueError(f"{path}: covariance: expected finite numbers, symmetric")
-    covariance = (covariance + covariance.T) / 2
-    try:
-        np.linalg.cholesky(covariance)
-    except np.linalg.LinAlgError:
-        raise ValueError(f"{path}: covariance: expected positive definite; are there frames enough?") from None
-    return MeasuredNoise(covariance)
+    return MeasuredNoise(read_noise(sensor.noise_covariance, layout.n_slopes))
 
 
 def slope_variance(sensor: Sensor, layout: SensorLayout, rate: float) -> Array:
@@ -122,24 +109,81 @@ def slope_variance(sensor: Sensor, layout: SensorLayout, rate: float) -> Array:
     """
     electrons = _electrons(sensor, layout, rate)
     photon = (sensor.spot_fwhm / _FWHM_PER_SIGMA * sensor.excess_noise) ** 2 / electrons
-    # pixel centres at (i - (n-1)/2) p, n x n of them: mean square (n^2-1)/12 p^2
-    squares = sensor.pixels**2 * (sensor.pixels**2 - 1) / 12 * sensor.pixel_scale**2
-    return np.tile(photon + sensor.read_noise**2 * squares / electrons**2, 2)
+    return np.tile(photon + sensor.read_noise**2 * _pixel_squares(sensor) / electrons**2, 2)
 
 
 def slope_noise(system: System, sensor: Sensor, layout: SensorLayout) -> SlopeNoise:
-    """Noise of a sensor on its star, whose spots are elongated if the instrument says where its laser leaves."""
+    """Noise of a sensor on its star: elongated spots if the instrument says where its laser leaves, cut by its stop."""
     variance = slope_variance(sensor, layout, system.loop.rate)
     star = system.star_of(sensor)
+    ex, ey = _elongation(system, star, layout)
+    if sensor.field_stop is not None:
+        return _behind_a_stop(sensor, layout, ex, ey, system.loop.rate)
+    per_square: Array = sensor.excess_noise**2 / _electrons(sensor, layout, system.loop.rate)
+    return SlopeNoise(variance + np.concatenate([ex**2, ey**2]) * np.tile(per_square, 2), ex * ey * per_square)
+
+
+def _elongation(system: System, star: GuideStar, layout: SensorLayout) -> tuple[Array, Array]:
+    """x and y, each (n_valid,), of the rms length that the sodium layer adds to each spot, along the sensor's axes."""
     if star.launch is None or star.sodium_thickness is None:
-        return SlopeNoise(variance, np.zeros(layout.n_valid))
+        return np.zeros(layout.n_valid), np.zeros(layout.n_valid)
     x, y = layout.to_pupil(*layout.local.T)
     x, y = x - star.launch[0], y - star.launch[1]
     c, s = np.cos(layout.rotation), np.sin(layout.rotation)
     stretch = star.sodium_thickness * system.airmass / system.los_range(star) ** 2 / _FWHM_PER_SIGMA
-    ex, ey = stretch * (c * x + s * y), stretch * (c * y - s * x)
-    per_square = sensor.excess_noise**2 / _electrons(sensor, layout, system.loop.rate)
-    return SlopeNoise(variance + np.concatenate([ex**2, ey**2]) * np.tile(per_square, 2), ex * ey * per_square)
+    return stretch * (c * x + s * y), stretch * (c * y - s * x)
+
+
+def _behind_a_stop(sensor: Sensor, layout: SensorLayout, ex: Array, ey: Array, rate: float) -> SlopeNoise:
+    assert sensor.field_stop is not None
+    round_spot = (sensor.spot_fwhm / _FWHM_PER_SIGMA) ** 2
+    S = _symmetric(ex**2 + round_spot, ex * ey, ey**2 + round_spot)
+    share, T = truncated_moments(S, sensor.field_stop / 2)
+    electrons = (share * _electrons(sensor, layout, rate))[:, None, None]
+    gain = T @ np.linalg.inv(S)
+    read = sensor.read_noise**2 * _pixel_squares(sensor) * np.eye(2)
+    once = np.linalg.solve(gain, sensor.excess_noise**2 * T / electrons + read / electrons**2)
+    N: Array = np.linalg.solve(gain, once.swapaxes(1, 2)).astype(np.float64)
+    return SlopeNoise(np.concatenate([N[:, 0, 0], N[:, 1, 1]]), N[:, 0, 1])
+
+
+def truncated_moments(S: Array, half: float) -> tuple[Array, Array]:
+    """What of Gaussians about the centre of a square lies in it.
+
+    Args:
+        S: (n, 2, 2) their second moments.
+        half: side of the square, half of it.
+
+    Returns:
+        (n,) the share; (n, 2, 2) second moments of what lies inside, for a share of 1.
+    """
+    across = np.sqrt(S[:, 0, 0])
+    reach = np.minimum(half, _TAILS * across)[:, None]
+    nodes, weights = np.polynomial.legendre.leggauss(_NODES)
+    x = reach * nodes
+    density = reach * weights * np.exp(-0.5 * (x / across[:, None]) ** 2) / (across[:, None] * math.sqrt(2 * math.pi))
+    # y at a given x is Gaussian, and cut at both ends
+    middle = (S[:, 0, 1] / S[:, 0, 0])[:, None] * x
+    width = np.sqrt(S[:, 1, 1] - S[:, 0, 1] ** 2 / S[:, 0, 0])[:, None]
+    low, high = (-half - middle) / width, (half - middle) / width
+    at_low, at_high = (np.exp(-0.5 * t**2) / math.sqrt(2 * math.pi) for t in (low, high))
+    inside = ndtr(high) - ndtr(low)
+    first = middle * inside + width * (at_low - at_high)
+    second = middle * first + width**2 * (inside + low * at_low - high * at_high) + middle * width * (at_low - at_high)
+    share = (density * inside).sum(axis=1)
+    moments = ((density * part).sum(axis=1) / share for part in (x**2 * inside, x * first, second))
+    return share, _symmetric(*moments)
+
+
+def _symmetric(xx: Array, xy: Array, yy: Array) -> Array:
+    """(n, 2, 2)"""
+    return np.moveaxis(np.array([[xx, xy], [xy, yy]]), -1, 0)
+
+
+def _pixel_squares(sensor: Sensor) -> float:
+    """Sum over a sub-aperture's pixels of their squared distance from the middle along an axis, rad^2."""
+    # pixel centres at (i - (n-1)/2) p, n x n of them: mean square (n^2-1)/12 p^2
+    return sensor.pixels**2 * (sensor.pixels**2 - 1) / 12 * sensor.pixel_scale**2
 
 
 def _electrons(sensor: Sensor, layout: SensorLayout, rate: float) -> Array:

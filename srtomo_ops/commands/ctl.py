@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import json
 import math
 import time
 from typing import TYPE_CHECKING
 
-from srtomo_ops.options import add_json, write_json
+from srtomo_ops.options import add_json, assignments, seconds, write_json
 
 if TYPE_CHECKING:
     from srtomo_ops.operator import Operator
@@ -18,13 +19,14 @@ EXAMPLE = """examples:
   srtomo ctl publish file                   have the SRTC publish its reconstructor 'file'
   srtomo ctl commit 0123456789abcdef 0123...   id and SHA-256, in hex, as 'srtomo ctl publish' printed them
   srtomo ctl close                          close the loop
+  srtomo ctl sky --set 'atmosphere.r0=10 cm' --over 10s    change the simulated plant while it runs
   srtomo ctl status"""
 
 _PATIENCE = 10.0  # s to find a node: one that was just started takes some seconds
 
 _ACTIONS = (
     "status", "configure", "activate", "deactivate", "cleanup", "close", "open", "start-sim", "publish", "commit",
-    "roll-back",
+    "roll-back", "sky",
 )  # fmt: skip
 
 
@@ -33,6 +35,15 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("action", choices=_ACTIONS, metavar="ACTION", help=", ".join(_ACTIONS))
     parser.add_argument("words", metavar="WORD", nargs="*", help="publish: LABEL; commit, roll-back: ID SHA256 (hex)")
     parser.add_argument("--namespace", default="", help="of the instrument (default: none)")
+    parser.add_argument(
+        "--set",
+        metavar="KEY=VALUE",
+        action="append",
+        default=[],
+        help="sky: what changes, with unit: atmosphere.r0, a layer's fraction or wind, a sensor's photons or place",
+    )
+    parser.add_argument("--over", metavar="TIME", type=seconds, default=0.0, help="sky: how long it takes (default: 0)")
+    parser.add_argument("--after", metavar="TIME", type=seconds, default=0.0, help="sky: when it begins (default: now)")
     add_json(parser)
 
 
@@ -50,6 +61,7 @@ def main(options: argparse.Namespace) -> int:
         )
     if options.action in ("commit", "roll-back"):
         identity, sha256 = _identity(*options.words)
+    changes = _changes(options)
     # rclpy's own handlers end the context under the call that Ctrl-C interrupts
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     operator = Operator(options.namespace, "ctl", patience=_PATIENCE)
@@ -67,6 +79,8 @@ def main(options: argparse.Namespace) -> int:
             numbers = {"id": f"{identity:016x}", "sha256": sha256.hex()}
         elif options.action in ("commit", "roll-back"):
             numbers = {"first_frame": operator.commit(identity, sha256, roll_back=options.action == "roll-back")}
+        elif options.action == "sky":
+            numbers = {"first_frame": operator.change_sky(changes, options.over, options.after)}
         else:
             numbers = _status(operator)
     finally:
@@ -78,6 +92,14 @@ def main(options: argparse.Namespace) -> int:
         print("done")
     write_json(options.json, numbers)
     return 0
+
+
+def _changes(options: argparse.Namespace) -> dict[str, str]:
+    """``--set`` as text, which the plant reads as an instrument file."""
+    if bool(options.set) != (options.action == "sky"):
+        raise ValueError("--set: expected with sky, and only there")
+    values = assignments(options.set, "--set")
+    return {key: value if isinstance(value, str) else json.dumps(value) for key, value in values.items()}
 
 
 def _identity(id_word: str, sha256_word: str) -> tuple[int, bytes]:

@@ -4,21 +4,25 @@ from __future__ import annotations
 
 import argparse
 import time
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
 from srtomo_core.layout import Layout
 from srtomo_core.reconstructor import Reconstructor
-from srtomo_ops.options import add_json, add_system, system_of, write_json
+from srtomo_ops.options import add_json, add_schedule, add_system, schedule_of, system_of, write_json
 from srtomo_ops.progress import Progress
-from srtomo_ops.simulate import SETTLING, plain_settings, program_of, run
+from srtomo_ops.simulate import SETTLING, Run, plain_settings, program_of, run
+from srtomo_sim.course import scheduled
 from srtomo_sim.plant import Plant
 from srtomo_sim.sky import prepare, strehl
 from srtomo_srtc.model import ground_prior
 from srtomo_srtc.reconstructors import implicit
 
-EXAMPLE = "example:\n  srtomo simulate gnao_ltao_sr --frames 1000 --seed 2 --set 'loop.rate=1 kHz'"
+EXAMPLE = """examples:
+  srtomo simulate gnao_ltao_sr --frames 1000 --seed 2 --set 'loop.rate=1 kHz'
+  srtomo simulate mini --frames 2000 --at '4 s' 'atmosphere.r0=10 cm' 'over=2 s'"""
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -30,6 +34,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     source = parser.add_mutually_exclusive_group()
     source.add_argument("--reconstructor", metavar="FILE", type=Path, help="use this one instead of building one")
     source.add_argument("--prior", choices=("file", "ground"), default="file", help="to build one with (default: file)")
+    add_schedule(parser)
     add_json(parser)
 
 
@@ -38,6 +43,7 @@ def main(options: argparse.Namespace) -> int:
     system = system_of(options)
     if options.frames <= SETTLING:
         raise ValueError(f"--frames: expected more than {SETTLING}, which are left out while the loop settles")
+    changes = scheduled(schedule_of(options), system.loop.rate)
     start = time.perf_counter()
     if options.reconstructor:
         reconstructor = Reconstructor.load(options.reconstructor)
@@ -48,7 +54,7 @@ def main(options: argparse.Namespace) -> int:
     if reconstructor.fingerprint != Layout(system).fingerprint:
         raise ValueError(f"{options.reconstructor}: made for another instrument than {system.name}")
     with Progress("sky") as progress:
-        sky = prepare(system, options.frames, options.seed, progress=progress.share)
+        sky = prepare(system, options.frames, options.seed, changes=changes, progress=progress.share)
     program = program_of(sky.layout, reconstructor, plain_settings(sky.layout, system.loop.leak))
     with Progress("loop") as progress:
         result = run(
@@ -62,9 +68,10 @@ def main(options: argparse.Namespace) -> int:
         "frames": options.frames,
         "seed": options.seed,
         "settling_frames": SETTLING,
+        "changes": [{"frame": c.frame, "over": c.over, "set": dict(c.values)} for c in changes],
         "wfe_nm": result.wfe() * 1e9,
         "tip_tilt_nm": float(np.sqrt(np.mean(result.tip_tilt[after, 0] ** 2))) * 1e9,
-        "fitting_nm": float(np.sqrt(np.mean(sky.targets[0].fitting_error()[after] ** 2))) * 1e9,
+        "fitting_nm": float(np.sqrt(np.mean(sky.fitting_error()[after] ** 2))) * 1e9,
         "strehl": float(np.mean(strehl(result.high_order[after, 0], system.science.wavelength))),
         "science_wavelength_m": system.science.wavelength,
         "seconds": time.perf_counter() - start,
@@ -76,5 +83,21 @@ def main(options: argparse.Namespace) -> int:
     print(f"  tip-tilt      {numbers['tip_tilt_nm']:8.1f} nm rms")
     print(f"  of it fitting {numbers['fitting_nm']:8.1f} nm rms")
     print(f"  Strehl        {numbers['strehl']:8.3f} at {system.science.wavelength * 1e9:g} nm (Marechal, no tip-tilt)")
+    if changes:
+        numbers["stretches"] = stretches = _stretches(result, [0, *(c.frame for c in changes), options.frames])
+        print("  between the changes' beginnings")
+        for stretch in stretches:
+            print(f"    frames {stretch['first']:6d} to {stretch['last']:6d} {stretch['wfe_nm']:8.1f} nm rms")
     write_json(options.json, numbers)
     return 0
+
+
+def _stretches(result: Run, edges: list[int]) -> list[dict[str, float]]:
+    """WFE of the stretches between edges, those without a science frame that counts left out."""
+    rows = []
+    for first, stop in pairwise(edges):
+        here = (result.frames >= max(first, SETTLING)) & (result.frames < stop)
+        if here.any():
+            wfe = float(np.sqrt(np.mean(result.high_order[here, 0] ** 2))) * 1e9
+            rows.append({"first": max(first, SETTLING), "last": stop - 1, "wfe_nm": wfe})
+    return rows

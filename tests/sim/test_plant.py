@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -129,3 +131,24 @@ def test_noise_of_elongated_spots_is_correlated(mini: System, sky: Sky) -> None:
     assert abs(rho).max() > 0.5
     assert (x * y).mean(axis=0) == pytest.approx(rho, abs=0.25)
     assert np.mean((x * y).mean(axis=0) * np.sign(rho)) == pytest.approx(np.mean(abs(rho)), abs=0.02)
+
+
+def test_measured_noise_is_drawn_as_it_was_measured(mini: System, sky: Sky, tmp_path: Path) -> None:
+    """Over the whole sensor: neighbours here go together, which no model of spots says."""
+    n = sky.layout.sensors[1].n_slopes
+    near = np.exp(-np.abs(np.subtract.outer(np.arange(n), np.arange(n))) / 3.0)
+    scale = np.linspace(1e-7, 3e-7, n)
+    covariance = near * np.outer(scale, scale)
+    np.savez(tmp_path / "noise.npz", covariance=covariance)
+    still = mini.with_changes({"guide_stars.*.jitter": 0.0})
+    plant = Plant(still.with_changes({"sensors.1.noise_covariance": str(tmp_path / "noise.npz")}), sky)
+    noise = np.array([plant.measure(k) - sky.slopes[k] for k in range(400)])
+    own = sky.layout.slopes_of(1)
+    whitened = np.linalg.solve(np.linalg.cholesky(covariance), noise[:, own].T)
+    assert whitened.std() == pytest.approx(1, abs=0.02)
+    beside = np.mean(noise[:, own][:, 1:] * noise[:, own][:, :-1] / (scale[1:] * scale[:-1]))
+    assert beside == pytest.approx(np.exp(-1 / 3), abs=0.02)
+    # the others have theirs
+    unmeasured = np.array([Plant(still, sky).measure(k) - sky.slopes[k] for k in range(5)])
+    assert np.array_equal(unmeasured[:, : own.start], noise[:5, : own.start])
+    assert np.array_equal(unmeasured[:, own.stop :], noise[:5, own.stop :])

@@ -36,7 +36,9 @@ def test_structure_function_of_drifting_screens(mini: System) -> None:
             ends = [(0, 0), (lag, 0), (0, lag), (-lag, 0), (0, -lag)]
             for value, (dx, dy) in zip(values, ends, strict=True):
                 for phase in screens.phases:
-                    add_values(phase, (x + dx) % screens.grid.size, (y + dy) % screens.grid.size, nowhere, value)
+                    add_values(
+                        phase, (x + dx) % screens.grid.size, (y + dy) % screens.grid.size, nowhere, np.ones(1), value
+                    )
             measured.append(((values[1:] - values[0]) ** 2).mean())
         at_lags = covariance(lags * screens.grid.step, mini.los_r0, mini.atmosphere.outer_scale)
         expected = 2 * (covariance(0.0, mini.los_r0, mini.atmosphere.outer_scale) - at_lags) * METRES_PER_RADIAN**2
@@ -74,7 +76,7 @@ def test_off_axis_stars_look_at_another_part_of_high_layers(mini: System) -> Non
         half_frame = 0.5 / mini.loop.rate * layer.wind_speed
         at_x = x + star.x * height - half_frame * math.cos(layer.wind_direction)
         at_y = y + star.y * height - half_frame * math.sin(layer.wind_direction)
-        add_values(phase, at_x / screens.grid.step, at_y / screens.grid.step, np.zeros((1, 2)), expected)
+        add_values(phase, at_x / screens.grid.step, at_y / screens.grid.step, np.zeros((1, 2)), np.ones(1), expected)
     assert wavefronts(screens, np.array([0]), x, y, star) == pytest.approx(expected, abs=1e-12)
 
 
@@ -97,7 +99,7 @@ def test_gradient_averages_over_square_and_exposure(mini: System, rotation: floa
     def surface(padded: np.ndarray, points: np.ndarray) -> np.ndarray:
         out = np.zeros((1, len(points)))
         steps = points / screens.grid.step % screens.grid.size
-        add_values(np.ascontiguousarray(padded), steps[:, 0], steps[:, 1], np.zeros((1, 2)), out)
+        add_values(np.ascontiguousarray(padded), steps[:, 0], steps[:, 1], np.zeros((1, 2)), np.ones(1), out)
         return out[0]
 
     expected = np.zeros((2, len(centres)))

@@ -16,7 +16,7 @@ from srtomo_srtc.fitting import Fit
 from srtomo_srtc.geometry import pupil_grid
 from srtomo_srtc.mirrors import mirror_wavefronts
 from srtomo_srtc.model import noise_covariance, noise_whitening, sightlines
-from srtomo_srtc.noise import read_noise, slope_noise, slope_variance
+from srtomo_srtc.noise import slope_noise, slope_variance
 from srtomo_srtc.predict import Prediction
 from srtomo_srtc.reconstructors import METHODS, implicit
 
@@ -98,6 +98,78 @@ def test_the_prior_has_every_block() -> None:
     assert noise_covariance(load_system("mini"), layout, 0.5).nnz == layout.n_slopes
 
 
+STOPPED = ELONGATED | {f"guide_stars.{i}.sodium_thickness": 60e3 for i in range(3)} | {"sensors.0.field_stop": 1.5e-5}
+
+
+def test_a_stopped_spot_against_photons() -> None:
+    """Centres of gravity of photons drawn one by one, calibrated by a spot that is moved on purpose."""
+    electrons, frames, read_noise, moved = 600, 4000, 1.5, 7e-7
+    system = load_system("mini", {**STOPPED, "sensors.0.excess_noise": 1.0, "sensors.0.read_noise": read_noise})
+    sensor, place = system.sensors[0], Layout(system).sensors[0]
+    system = system.with_changes({"sensors.0.photons": electrons * system.loop.rate / place.size**2})
+    sensor = system.sensors[0]
+    whole = system.with_changes({"sensors.0.field_stop": 1.0, "sensors.0.read_noise": 0.0})
+    unstopped, stopped = slope_noise(whole, whole.sensors[0], place), slope_noise(system, sensor, place)
+    n, half = place.n_valid, sensor.field_stop / 2
+    squares = (np.arange(sensor.pixels) - (sensor.pixels - 1) / 2) ** 2 * sensor.pixel_scale**2
+    rng = np.random.default_rng(5)
+
+    def centres(factor: np.ndarray, shift: np.ndarray) -> np.ndarray:
+        counts = rng.poisson(electrons * light, frames)
+        photons = rng.standard_normal((counts.sum(), 2)) @ factor.T + shift
+        frame = np.repeat(np.arange(frames), counts)
+        inside = (np.abs(photons) <= half).all(axis=1)
+        totals = np.bincount(frame[inside], minlength=frames)
+        sums = np.stack([np.bincount(frame[inside], photons[inside, a], frames) for a in (0, 1)])
+        sums += read_noise * np.sqrt(sensor.pixels * squares.sum()) * rng.standard_normal(sums.shape)
+        return sums / totals
+
+    lit = np.flatnonzero(place.illumination == 1)
+    for one in (lit[0], lit[len(lit) // 3]):
+        light = place.illumination[one]
+        off = unstopped.covariance[one]
+        spot = electrons * light * np.array([[unstopped.variance[one], off], [off, unstopped.variance[n + one]]])
+        factor = np.linalg.cholesky(spot)
+        assert np.trace(spot) > 0.3 * half**2  # much of it does not pass
+        gain = np.empty((2, 2))
+        for axis, direction in enumerate(np.eye(2)):
+            state = rng.bit_generator.state
+            ahead = centres(factor, moved * direction).mean(axis=1)
+            rng.bit_generator.state = state  # the same photons
+            gain[:, axis] = (ahead - centres(factor, -moved * direction).mean(axis=1)) / (2 * moved)
+        found = np.cov(np.linalg.solve(gain, centres(factor, np.zeros(2))))
+        off = stopped.covariance[one]
+        expected = np.array([[stopped.variance[one], off], [off, stopped.variance[n + one]]])
+        np.testing.assert_allclose(found, expected, atol=0.07 * np.abs(expected).max())
+        assert np.trace(expected) > 1.1 * np.trace(spot) / (electrons * light)
+
+
+def test_a_wide_stop_changes_nothing() -> None:
+    system = load_system("mini", ELONGATED)
+    place = Layout(system).sensors[0]
+    open_field = slope_noise(system, system.sensors[0], place)
+    wide = system.with_changes({"sensors.0.field_stop": 20 * ARCSEC})
+    behind = slope_noise(wide, wide.sensors[0], place)
+    np.testing.assert_allclose(behind.variance, open_field.variance, rtol=1e-6)
+    np.testing.assert_allclose(behind.covariance, open_field.covariance, rtol=1e-6, atol=1e-20)
+
+
+def test_along_a_spot_much_longer_than_its_stop_there_is_no_information() -> None:
+    """Only the direction across is left of N^-1, as with what Bechet et al. suppose of truncated spots."""
+    system = load_system("mini", {**ELONGATED, "guide_stars.0.sodium_thickness": 3000e3, "sensors.0.field_stop": 1e-5})
+    place = Layout(system).sensors[0]
+    noise = slope_noise(system, system.sensors[0], place)
+    n = place.n_valid
+    N = np.moveaxis(np.array([[noise.variance[:n], noise.covariance], [noise.covariance, noise.variance[n:]]]), -1, 0)
+    values, vectors = np.linalg.eigh(np.linalg.inv(N))
+    line = np.stack(place.to_pupil(*place.local.T), axis=1) - system.guide_stars[0].launch
+    c, s = np.cos(place.rotation), np.sin(place.rotation)
+    along = np.einsum("ni,ni->n", line @ [[c, -s], [s, c]], vectors[:, :, 1]) / np.hypot(*line.T)
+    far = np.hypot(*line.T) > 1
+    assert (values[far, 0] < 1e-2 * values[far, 1]).all()
+    assert (np.abs(along[far]) < 1e-2).all()
+
+
 def test_whitening_whitens() -> None:
     system = load_system("mini", ELONGATED)
     layout = Layout(system)
@@ -149,24 +221,6 @@ def test_the_prediction_sees_all_of_the_noise() -> None:
     shapes = shapes * np.sqrt(grid.weight)[:, None]
     shapes -= low @ np.linalg.lstsq(low, shapes, rcond=None)[0]
     assert added == pytest.approx(np.trace(shapes @ R @ extra @ R.T @ shapes.T), rel=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("content", "problem"),
-    [
-        ({"cov": np.eye(4)}, "expected an .npz file with numbers in 'covariance'"),
-        ({"covariance": np.eye(5)}, r"covariance: expected shape \(4, 4\), got \(5, 5\)"),
-        ({"covariance": np.full((4, 4), np.nan)}, "covariance: expected finite numbers, symmetric"),
-        ({"covariance": np.triu(np.ones((4, 4)))}, "covariance: expected finite numbers, symmetric"),
-        ({"covariance": -np.eye(4)}, "covariance: expected positive definite; are there frames enough\\?"),
-    ],
-)
-def test_a_file_that_is_no_covariance(content: dict[str, np.ndarray], problem: str, tmp_path: Path) -> None:
-    np.savez(tmp_path / "noise.npz", **content)
-    with pytest.raises(ValueError, match=problem):
-        read_noise(str(tmp_path / "noise.npz"), 4)
-    with pytest.raises(ValueError, match="No such file"):
-        read_noise(str(tmp_path / "none.npz"), 4)
 
 
 def test_the_elongated_prior_leaves_less_error(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,0 +1,369 @@
+"""Second moments of pseudo-open-loop slopes, from the messages of a running or recorded loop, in bounded memory.
+
+    s[k] = P (y[k] + G m~[k])
+
+y are the slopes as measured, m~ what was on the mirrors in that exposure, whatever the loop made of it: open, held,
+clipped or offset. P takes the blind modes of each sensor out.
+
+The window is a ring of blocks of equal time. Of every block the last part is held out, for models to be judged by
+frames that they were not fitted to; block by block its moments stay apart, for a jackknife. Every q-th exposure counts:
+successive frames say nearly the same of the turbulence, and noise is learned from few.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg.blas import sgemm, ssyrk
+
+from srtomo_core import wire
+from srtomo_core.bag import BagReader
+from srtomo_core.layout import Layout
+from srtomo_core.system import System
+from srtomo_core.wire import DmCommand, SlopeFrame
+from srtomo_srtc.matching import Matched, Matcher, Tally
+from srtomo_srtc.memory import require
+from srtomo_srtc.model import blind_modes, layout_of
+
+Floats = NDArray[np.float32]
+
+WINDOW = 16.0
+"""s of a window by default."""
+
+BLOCKS = 8
+"""Blocks of a window by default."""
+
+COUNTED_RATE = 125.0
+"""Hz: frames that count, by default; of a slower loop every one."""
+
+HELD_OUT = 0.2
+"""Share of every block that is held out."""
+
+_BATCH = 256  # rows that become pseudo-open-loop slopes at a time: enough for products to run at full speed
+
+
+@dataclass(frozen=True, eq=False)
+class Moments:
+    """First and second moments of some frames.
+
+    Attributes:
+        covariance: (n_slopes, n_slopes) about ``mean``, divided by the number of frames, rad^2.
+        mean: (n_slopes,) rad. ``covariance + outer(mean, mean)`` is the second moment about zero.
+        n_frames: how many.
+    """
+
+    covariance: NDArray[np.float32]
+    mean: NDArray[np.float64]
+    n_frames: int
+
+
+@dataclass(frozen=True, eq=False)
+class HeldOut:
+    """Whole frames that are in no moment, so that a model fitted to those can be judged.
+
+    Runs of successive counted frames, one run a block of the window; oldest first.
+
+    Attributes:
+        slopes: (n_held, n_slopes) pseudo-open-loop slopes without blind modes, P (y + G m~), rad.
+        measured: (n_held, n_slopes) slopes as measured, without blind modes, P y, rad.
+        frames: (n_held,) exposure numbers.
+        block: (n_held,) index of the run that each belongs to, ascending from 0: what a jackknife leaves out.
+        reconstructor: (n_held,) id of the reconstructor that answered the exposure; 0 when none was active.
+    """
+
+    slopes: NDArray[np.float32]
+    measured: NDArray[np.float32]
+    frames: NDArray[np.int64]
+    block: NDArray[np.intp]
+    reconstructor: NDArray[np.uint64]
+
+
+@dataclass(frozen=True, eq=False)
+class Statistics(Moments):
+    """Second moments of pseudo-open-loop slopes ``s = P (y + G m~)`` over a window.
+
+    P takes the blind modes (a laser star's tip-tilt) out of each frame; m~ is what was on the mirrors in the exposure.
+
+    Attributes:
+        interval: s between counted frames (they may be every q-th exposure).
+        duration: s from the window's first counted frame to its last.
+        lagged: lag in exposures to (n_slopes, n_slopes) <s[k] s[k-lag]^T> about ``mean``, rad^2.
+        lagged_frames: lag to the number of pairs in it.
+        blocks: the moments of successive stretches of the window; pooled they are the window's.
+        held_out: frames that are in none of these.
+        session, first_frame, last_frame: the exposures that the window spans.
+    """
+
+    interval: float
+    duration: float
+    lagged: Mapping[int, NDArray[np.float32]]
+    lagged_frames: Mapping[int, int]
+    blocks: tuple[Moments, ...]
+    held_out: HeldOut
+    session: int
+    first_frame: int
+    last_frame: int
+
+
+class _Block:
+    """Running sums of one stretch of the window; matrices in Fortran order, of squares the upper triangle."""
+
+    def __init__(self, index: int, n_slopes: int, lags: Sequence[int]) -> None:
+        self.index = index
+        self.n_frames = 0
+        self.sum = np.zeros(n_slopes)
+        self.squares = np.zeros((n_slopes, n_slopes), np.float32, order="F")
+        self.lagged = {lag: np.zeros((n_slopes, n_slopes), np.float32, order="F") for lag in lags}
+        self.lagged_frames = dict.fromkeys(lags, 0)
+        self.held_out: list[tuple[Floats, Floats, NDArray[np.int64], NDArray[np.uint64]]] = []
+        self.first_frame = self.last_frame = -1
+
+    def add(self, rows: Floats) -> None:
+        """Count frames (n, n_slopes)."""
+        self.n_frames += len(rows)
+        self.sum += rows.sum(axis=0, dtype=np.float64)
+        self.squares = ssyrk(1.0, rows.T, beta=1.0, c=self.squares, overwrite_c=1)
+
+    def add_lagged(self, lag: int, rows: Floats, earlier: Floats) -> None:
+        """Count pairs, (n, n_slopes) each."""
+        self.lagged_frames[lag] += len(rows)
+        self.lagged[lag] = sgemm(1.0, rows.T, earlier.T, beta=1.0, c=self.lagged[lag], trans_b=1, overwrite_c=1)
+
+    def moments(self) -> Moments:
+        return _moments(self.squares, self.sum, self.n_frames)
+
+
+def _moments(squares: Floats, total: NDArray[np.float64], n_frames: int) -> Moments:
+    """From sums; of ``squares`` only the upper triangle counts."""
+    mean = total / n_frames
+    squares = squares / np.float32(n_frames)
+    squares -= np.outer(mean, mean).astype(np.float32)
+    upper = np.triu(squares)
+    upper += np.triu(squares, 1).T
+    return Moments(upper, mean, n_frames)
+
+
+class Telemetry:
+    """Accumulates :class:`Statistics` from SlopeFrames and DmCommands. One thread calls everything.
+
+    Memory: ``4 n_slopes^2`` bytes a block, as many for each lag in it, as many for its moments once they are asked for;
+    and some for batches and held-out frames.
+
+    Attributes:
+        every: exposures from one counted frame to the next.
+        tally: what became of the frames asked for; :class:`Tally`.
+    """
+
+    def __init__(
+        self,
+        system: System,
+        G: NDArray[np.floating],
+        *,
+        layout: Layout | None = None,
+        window: float = WINDOW,
+        blocks: int = BLOCKS,
+        every: int | None = None,
+        lags: Sequence[int] = (),
+        held_out: float = HELD_OUT,
+    ) -> None:
+        """Begin with an empty window.
+
+        Args:
+            G: (n_slopes, n_commands) the calibrated interaction matrix, rad/m.
+            layout: of the slopes and commands; as in the system when not given.
+            window: s.
+            blocks: that the window consists of.
+            every: exposures from one counted frame to the next; by default what makes :data:`COUNTED_RATE`.
+            lags: in exposures, at which lagged moments are formed.
+            held_out: share of every block that is held out, 0 for none.
+
+        Raises:
+            ValueError: G is of another instrument, or a block is too short for some counted frames.
+            MemoryError: one line, before any work, if there is not enough.
+        """
+        layout = layout_of(system, layout)
+        if G.shape != (layout.n_slopes, layout.n_commands):
+            raise ValueError(f"G: expected shape ({layout.n_slopes}, {layout.n_commands}), got {G.shape}")
+        if blocks < 1 or any(lag < 1 for lag in lags) or not 0 <= held_out < 1:
+            raise ValueError("blocks and lags: expected at least 1; held_out: expected 0 to less than 1")
+        rate = system.loop.rate
+        self.every = max(1, round(rate / COUNTED_RATE)) if every is None else every
+        self._block_length = round(window * rate / blocks / self.every)  # counted frames, held-out ones included
+        self._fit_length = self._block_length - round(held_out * self._block_length)
+        if self.every < 1 or self._fit_length < 2:
+            raise ValueError(f"window: {window:g} s in {blocks} blocks leaves fewer than 2 counted frames a block")
+        self._lags = tuple(sorted(set(lags)))
+        n, m = G.shape
+        require(
+            4.0 * n * n * (blocks + 1) * (2 + len(lags))
+            + 8.0 * n * (self._block_length - self._fit_length) * (blocks + 1)
+            + 4.0 * (4 * n + m) * _BATCH,
+            f"telemetry of {system.name}",
+        )
+        self._period = 1 / rate
+        self._G_transposed = np.ascontiguousarray(G.T, np.float32)
+        self._blind = np.ascontiguousarray(blind_modes(system, layout), np.float32)
+        self._matcher = Matcher(layout, self._is_wanted)
+        self._measured, self._mirror = np.empty((_BATCH, n), np.float32), np.empty((_BATCH, m), np.float32)
+        self._blocks: deque[_Block] = deque(maxlen=blocks + 1)  # the last one is being filled
+        self.restart()
+
+    def restart(self) -> None:
+        """Empty the window."""
+        self._batch: list[Matched] = []
+        self._tail = np.empty((0, len(self._blind)), np.float32)  # the last rows, for pairs at a lag
+        self._tail_frames: list[int] = []
+        self._blocks.clear()
+        self._session = 0
+
+    @property
+    def tally(self) -> Tally:
+        """What became of the frames asked for so far."""
+        return self._matcher.tally
+
+    def add_slopes(self, message: bytes | SlopeFrame) -> None:
+        """Take a SlopeFrame, serialised or read."""
+        self._matcher.add_slopes(message)
+
+    def add_command(self, message: bytes | DmCommand) -> None:
+        """Take a DmCommand, serialised or read. Once in a while this takes as long as a batch of frames."""
+        self._matcher.add_command(message)
+        self._take()
+
+    def feed(self, bag: BagReader) -> None:
+        """Take all slopes and commands of a bag.
+
+        Raises:
+            BagError: the bag holds none, or is damaged.
+        """
+        slopes, commands = bag.topic(wire.SLOPES.name), bag.topic(wire.COMMAND.name)
+        for message in bag.messages(slopes, commands):
+            (self.add_slopes if message.topic == slopes else self.add_command)(message.data)
+        self._take(final=True)
+
+    def statistics(self) -> Statistics:
+        """The moments of the window as it stands.
+
+        Raises:
+            ValueError: fewer than two frames were counted in it.
+        """
+        self._flush()
+        blocks = [block for block in self._blocks if block.n_frames]
+        n_frames = sum(block.n_frames for block in blocks)
+        if n_frames < 2:
+            raise ValueError(f"telemetry: expected at least 2 frames to count, got {n_frames}")
+        squares = np.sum([block.squares for block in blocks], axis=0)
+        pooled = _moments(squares, np.sum([block.sum for block in blocks], axis=0), n_frames)
+        lagged, lagged_frames = {}, {}
+        for lag in self._lags:
+            pairs = sum(block.lagged_frames[lag] for block in blocks)
+            if pairs:
+                lagged_frames[lag] = pairs
+                lagged[lag] = np.sum([block.lagged[lag] for block in blocks], axis=0) / np.float32(pairs)
+                lagged[lag] -= np.outer(pooled.mean, pooled.mean).astype(np.float32)
+        first, last = blocks[0].first_frame, blocks[-1].last_frame
+        return Statistics(
+            pooled.covariance,
+            pooled.mean,
+            n_frames,
+            interval=self.every * self._period,
+            duration=(last - first) * self._period,
+            lagged=lagged,
+            lagged_frames=lagged_frames,
+            blocks=tuple(block.moments() for block in blocks),
+            held_out=self._held_out(),
+            session=self._session,
+            first_frame=first,
+            last_frame=last,
+        )
+
+    def _held_out(self) -> HeldOut:
+        runs = [block.held_out for block in self._blocks if block.held_out]
+        n = len(self._blind)
+        parts = [part for run in runs for part in run] or [
+            (np.empty((0, n), np.float32), np.empty((0, n), np.float32), np.empty(0, np.int64), np.empty(0, np.uint64))
+        ]
+        slopes, measured, frames, reconstructor = (np.concatenate(column) for column in zip(*parts, strict=True))
+        lengths = [sum(len(part[2]) for part in run) for run in runs]
+        return HeldOut(slopes, measured, frames, np.repeat(np.arange(len(runs)), lengths), reconstructor)
+
+    # -- frames -----------------------------------------------------------------------------------------------------
+
+    def _is_wanted(self, frame: int) -> bool:
+        """Whether a frame counts, or is the earlier one of a pair."""
+        return any((frame + lag) % self.every == 0 for lag in (0, *self._lags))
+
+    def _place(self, frame: int) -> tuple[int, bool]:
+        """The block that a frame is in, and whether it is held out there."""
+        block, place = divmod(frame // self.every, self._block_length)
+        return block, place >= self._fit_length
+
+    def _take(self, final: bool = False) -> None:
+        for exposure in self._matcher.take(final):
+            if exposure.session != self._session:
+                # frame numbers begin anew: the window does too
+                self._flush()
+                self.restart()
+                self._session = exposure.session
+            self._batch.append(exposure)
+            if len(self._batch) == _BATCH:
+                self._flush()
+
+    def _flush(self) -> None:
+        """Turn the batch into rows of pseudo-open-loop slopes, and count these."""
+        batch, self._batch = self._batch, []
+        if not batch:
+            return
+        measured, mirror = self._measured[: len(batch)], self._mirror[: len(batch)]
+        for i, exposure in enumerate(batch):
+            measured[i], mirror[i] = exposure.slopes, exposure.mirror
+        slopes = self._seen(measured + mirror @ self._G_transposed)
+        frames = [exposure.frame for exposure in batch]
+        reconstructor = np.array([exposure.reconstructor for exposure in batch], np.uint64)
+        known = self._tail_frames + frames
+        rows = np.concatenate([self._tail, slopes]) if self._lags else slopes
+        row_of = {frame: i for i, frame in enumerate(known)}
+        places = [self._place(frame) for frame in frames]
+        counted = [frame % self.every == 0 for frame in frames]
+        for index in sorted({block for (block, _), counts in zip(places, counted, strict=True) if counts}):
+            block = self._block(index)
+            here = [i for i, place in enumerate(places) if counted[i] and place[0] == index]
+            fit = [i for i in here if not places[i][1]]
+            held = [i for i in here if places[i][1]]
+            if fit:
+                block.add(slopes[fit])
+                block.first_frame = frames[fit[0]] if block.first_frame < 0 else block.first_frame
+                block.last_frame = frames[fit[-1]]
+            if held:
+                block.held_out.append(
+                    (slopes[held], self._seen(measured[held]), np.array(frames)[held], reconstructor[held])
+                )
+            for lag in self._lags:
+                # the earlier one of a pair must not be held out either
+                pairs = [
+                    (row_of[frames[i]], row_of[frames[i] - lag])
+                    for i in fit
+                    if frames[i] - lag in row_of and not self._place(frames[i] - lag)[1]
+                ]
+                if pairs:
+                    now, earlier = np.array(pairs).T
+                    block.add_lagged(lag, rows[now], rows[earlier])
+        if self._lags:
+            keep = [i for i, frame in enumerate(known) if frame > known[-1] - self._lags[-1]]
+            self._tail, self._tail_frames = rows[keep], [known[i] for i in keep]
+
+    def _seen(self, rows: Floats) -> Floats:
+        """Rows without blind modes: each times P."""
+        return np.asarray(rows - (rows @ self._blind) @ self._blind.T)
+
+    def _block(self, index: int) -> _Block:
+        if not self._blocks or self._blocks[-1].index != index:
+            # blocks that a gap has left empty are gone from the window all the same
+            while self._blocks and self._blocks[0].index < index + 1 - (self._blocks.maxlen or 0):
+                self._blocks.popleft()
+            self._blocks.append(_Block(index, len(self._blind), self._lags))
+        return self._blocks[-1]
