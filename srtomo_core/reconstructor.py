@@ -4,6 +4,9 @@ Pseudo-open-loop control of gain g with exposures ``y[k-j]``, j = 0 .. n_epochs-
 that were on the mirror during them::
 
     u[k] = (1-g) u[k-1] + g sum_j ( R_j (y[k-j] - y_ref) + Q_j u~[k-j] ),     Q_j = R_j G
+
+R_0 alone has the wrong gain: with more than one exposure, a whole reconstructor for the newest one alone comes along,
+the fallback for when the loop does not have the others.
 """
 
 from __future__ import annotations
@@ -13,6 +16,7 @@ import json
 import os
 import zipfile
 from collections.abc import Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -38,9 +42,16 @@ def _frozen(values: ArrayLike) -> Floats:
     return array
 
 
+def _product(R: Floats, G: NDArray[np.float64], threads: int) -> NDArray[np.float64]:
+    """R G in float64, a stretch of rows on each thread."""
+    with ThreadPoolExecutor(threads) as pool:
+        parts = pool.map(lambda rows: rows.astype(np.float64) @ G, np.array_split(R, threads))
+        return np.concatenate(list(parts))
+
+
 @dataclass(frozen=True)
 class Block:
-    """Rows ``first_row ..`` of ``R`` (matrix 0) or ``Q`` (matrix 1) of one epoch."""
+    """Rows ``first_row ..`` of ``R`` (matrix 0) or ``Q`` (matrix 1) of one epoch, or of the fallback."""
 
     index: int
     epoch: int
@@ -49,11 +60,19 @@ class Block:
     rows: Floats
 
 
+def n_parts(n_epochs: int) -> int:
+    """Pairs of R and Q of a reconstructor: one an epoch and, with more than one, the fallback's."""
+    return n_epochs + (n_epochs > 1)
+
+
 def block_table(n_commands: int, n_epochs: int) -> list[tuple[int, int, int, int]]:
-    """The blocks that a reconstructor travels in: (epoch, matrix, first_row, n_rows), by block index."""
+    """The blocks that a reconstructor travels in: (epoch, matrix, first_row, n_rows), by block index.
+
+    The fallback, if there is one, travels as epoch ``n_epochs``.
+    """
     return [
         (epoch, matrix, first, min(_ROWS_PER_BLOCK, n_commands - first))
-        for epoch in range(n_epochs)
+        for epoch in range(n_parts(n_epochs))
         for matrix in (0, 1)
         for first in range(0, n_commands, _ROWS_PER_BLOCK)
     ]
@@ -74,6 +93,8 @@ class Reconstructor:
             receives R and Q can check that they belong together.
         label: for people; not part of the identity.
         provenance: what made it, from what; JSON values; not part of the identity.
+        fallback_R, fallback_Q: (n_commands, n_slopes) m/rad and (n_commands, n_commands), for the newest exposure
+            alone; with several epochs, and only then.
     """
 
     fingerprint: bytes
@@ -86,6 +107,8 @@ class Reconstructor:
     probe_slopes: Floats
     label: str = ""
     provenance: Mapping[str, Any] = field(default_factory=dict)
+    fallback_R: Floats | None = None
+    fallback_Q: Floats | None = None
 
     def __post_init__(self) -> None:
         for name in ("R", "Q", "slope_reference", "command_limit", "probe_commands", "probe_slopes"):
@@ -103,6 +126,14 @@ class Reconstructor:
         ):
             if getattr(self, name).shape != shape:
                 raise ReconstructorError(f"{name}: expected shape {shape}, got {getattr(self, name).shape}")
+        for name, shape in (("fallback_R", (commands, slopes)), ("fallback_Q", (commands, commands))):
+            value = getattr(self, name)
+            if (value is None) != (epochs == 1):
+                raise ReconstructorError(f"{name}: expected with several epochs, and only then")
+            if value is not None:
+                object.__setattr__(self, name, _frozen(value))
+                if value.shape != shape:
+                    raise ReconstructorError(f"{name}: expected shape {shape}, got {value.shape}")
         if len(self.fingerprint) != 32:
             raise ReconstructorError(f"fingerprint: expected 32 bytes, got {len(self.fingerprint)}")
 
@@ -118,22 +149,30 @@ class Reconstructor:
         slope_reference: ArrayLike | None = None,
         label: str = "",
         provenance: Mapping[str, Any] | None = None,
+        fallback: ArrayLike | None = None,
+        threads: int = 1,
     ) -> Reconstructor:
-        """A static reconstructor from R (n_commands, n_slopes) and the interaction matrix G (n_slopes, n_commands).
+        """A reconstructor from R and the interaction matrix G (n_slopes, n_commands).
 
-        Q is formed in float64 from R as it will be applied, rounded to float32.
+        Each Q is formed in float64 from R as it will be applied, rounded to float32.
+
+        Args:
+            R: (n_commands, n_slopes), or (n_epochs, n_commands, n_slopes) with a ``fallback`` (n_commands, n_slopes).
+            threads: to form Q with, apart from those of the BLAS library.
         """
-        applied = np.asarray(R, dtype=np.float32).astype(np.float64)
+        applied = np.asarray(R, dtype=np.float32)
+        applied = applied[None] if applied.ndim == 2 else applied
         model = np.asarray(G, dtype=np.float64)
-        if applied.ndim != 2 or model.shape != applied.shape[::-1]:
-            raise ReconstructorError(f"G: expected shape {applied.shape[::-1]}, got {model.shape}")
-        n_commands, n_slopes = applied.shape
+        if applied.ndim != 3 or model.shape != applied.shape[:0:-1]:
+            raise ReconstructorError(f"G: expected shape {applied.shape[:0:-1]}, got {model.shape}")
+        n_commands, n_slopes = applied.shape[1:]
+        alone = None if fallback is None else np.asarray(fallback, dtype=np.float32)
         # any fixed vectors do: they only have to excite every row of Q
         probes = np.random.default_rng(0).standard_normal((_PROBES, n_commands)).astype(np.float32) * np.float32(1e-7)
         return cls(
             fingerprint=fingerprint,
-            R=_frozen(applied[None]),
-            Q=_frozen((applied @ model)[None]),
+            R=_frozen(applied),
+            Q=_frozen(np.stack([_product(part, model, threads) for part in applied])),
             gain=gain,
             slope_reference=_frozen(np.zeros(n_slopes) if slope_reference is None else slope_reference),
             command_limit=_frozen(command_limit),
@@ -141,6 +180,24 @@ class Reconstructor:
             probe_slopes=_frozen(probes.astype(np.float64) @ model.T),
             label=label,
             provenance=dict(provenance or {}),
+            fallback_R=alone,
+            fallback_Q=None if alone is None else _frozen(_product(alone, model, threads)),
+        )
+
+    @classmethod
+    def from_parts(cls, n_epochs: int, R: Floats, Q: Floats, **fields: Any) -> Reconstructor:
+        """From R (n_parts, n_commands, n_slopes) and Q in the order of :attr:`parts`; ``fields`` are all others."""
+        fallback = {} if n_epochs == 1 else {"fallback_R": R[n_epochs], "fallback_Q": Q[n_epochs]}
+        return cls(R=R[:n_epochs], Q=Q[:n_epochs], **fallback, **fields)
+
+    @property
+    def parts(self) -> list[tuple[Floats, Floats]]:
+        """R and Q of each epoch, then the fallback's if there is one; views, not copies."""
+        pairs = list(zip(self.R, self.Q, strict=True))
+        return (
+            pairs
+            if self.fallback_R is None or self.fallback_Q is None
+            else [*pairs, (self.fallback_R, self.fallback_Q)]
         )
 
     @property
@@ -160,12 +217,12 @@ class Reconstructor:
 
     @cached_property
     def sha256(self) -> bytes:
-        """Digest of all that decides a command: fingerprint, shapes, gain, limits, reference, R and Q."""
+        """Digest of all that decides a command: fingerprint, shapes, gain, limits, reference, R, Q and the fallback."""
         digest = hashlib.sha256(_FORMAT.encode())
         digest.update(self.fingerprint)
         digest.update(np.array(self.R.shape, dtype="<u4").tobytes())
         digest.update(np.array([self.gain], dtype="<f4").tobytes())
-        for array in (self.slope_reference, self.command_limit, self.R, self.Q):
+        for array in (self.slope_reference, self.command_limit, self.R, self.Q, *sum(self.parts[self.n_epochs :], ())):
             digest.update(array.data)
         return digest.digest()
 
@@ -176,13 +233,15 @@ class Reconstructor:
 
     def blocks(self) -> Iterator[Block]:
         """The rows in the order of :func:`block_table`; views, not copies."""
+        parts = self.parts
         for index, (epoch, matrix, first, rows) in enumerate(block_table(self.n_commands, self.n_epochs)):
-            source = self.R if matrix == 0 else self.Q
-            yield Block(index, epoch, matrix, first, source[epoch, first : first + rows])
+            yield Block(index, epoch, matrix, first, parts[epoch][matrix][first : first + rows])
 
     def save(self, path: str | Path, interaction_matrix: ArrayLike | None = None) -> None:
         """Write an ``.npz`` with R, Q, provenance and, when given, G; whole or not at all."""
         extra = {} if interaction_matrix is None else {"G": np.asarray(interaction_matrix, dtype=np.float32)}
+        if self.fallback_R is not None and self.fallback_Q is not None:
+            extra |= {"fallback_R": self.fallback_R, "fallback_Q": self.fallback_Q}
         header = {
             "format": _FORMAT,
             "sha256": self.sha256.hex(),
@@ -219,6 +278,7 @@ class Reconstructor:
                 provenance=header["provenance"],
                 **{name: arrays[name] for name in ("R", "Q", "slope_reference", "command_limit",
                                                    "probe_commands", "probe_slopes")},
+                **{name: arrays[name] for name in ("fallback_R", "fallback_Q") if name in arrays},
             )  # fmt: skip
             expected = header["sha256"]
         except (KeyError, TypeError) as error:

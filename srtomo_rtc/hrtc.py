@@ -18,9 +18,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from srtomo_core.exposure import Exposure, fits, subaperture_starts
 from srtomo_core.layout import Layout
 from srtomo_core.wire import DmCommandWriter, SlopeFrame, WireError, read_slope_frame
-from srtomo_rtc.exposure import Exposure, fits, subaperture_starts
 from srtomo_rtc.latency import LatencyHistogram
 from srtomo_rtc.loop import HISTORY, Loop, Program, Verdict
 
@@ -102,6 +102,7 @@ class Hrtc:
         publish: called with each serialised DmCommand, on the loop's thread.
         deadline_ns: latency above which a frame counts as a miss.
         max_behind: complete frames that may wait before whole frames are skipped.
+        max_epochs: exposures that a reconstructor may use.
     """
 
     def __init__(
@@ -112,10 +113,11 @@ class Hrtc:
         *,
         deadline_ns: int = 1_000_000_000,
         max_behind: int = 4,
+        max_epochs: int = 1,
     ) -> None:
         if not 1 <= max_behind < _AHEAD:
             raise ValueError(f"max_behind: expected 1 to {_AHEAD - 1} frames, got {max_behind}")
-        self.loop = Loop(layout, delay)
+        self.loop = Loop(layout, delay, max_epochs)
         self.counters = Counters()
         self.latency = LatencyHistogram(deadline_ns)
         self.changes: queue.SimpleQueue[Change] = queue.SimpleQueue()

@@ -9,6 +9,12 @@ state and there is no wind-up. With ``m~[k]`` on the mirror during exposure k, `
 
 With ``polc`` off the same loop is a classical leaky integrator: ``c = (1-leak) u[k-1] - g R y_ref``.
 
+A reconstructor of several epochs adds ``g sum_j>=1 (R_j (y[k-j] - y_ref) + Q_j u~[k-j])`` to c, so that the command
+waits for nothing more than with one. It needs the N-1 exposures before, all of them answered OK in a closed loop: with
+one of them held, missing, from an open loop or from before the session, the fallback makes the command, a whole
+reconstructor for one exposure (R_0 alone would have the wrong gain). What is remembered are slopes and what was on the
+mirror, not products: a commit costs no fallback.
+
 The history holds m, indexed by exposure, and o is taken off when it is used: an offset and its slope reference
 ``y_ref = -G o`` then change together without a transient, whatever the delay.
 
@@ -20,7 +26,7 @@ from __future__ import annotations
 
 import enum
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -37,6 +43,11 @@ Floats = NDArray[np.float32]
 
 HISTORY = 64
 """Commands remembered, in frames."""
+
+MAX_EPOCHS = 8
+"""Exposures that a loop can be made for."""
+
+_NEVER = -(2**62)  # no frame has this number, nor the one before the first
 
 
 class Verdict(enum.IntEnum):
@@ -81,13 +92,56 @@ class Settings:
             object.__setattr__(self, name, float(np.float32(getattr(self, name))))
 
 
-class Slot:
-    """Memory for one reconstructor, by sensor and by columns. Made once, filled off the loop."""
+class Columns:
+    """R and Q for one exposure, by columns: R sensor by sensor.
+
+    Attributes:
+        R: of each sensor, (n_slopes_w, n_commands).
+        Q: (n_commands, n_commands).
+    """
 
     def __init__(self, layout: Layout) -> None:
         m = layout.n_commands
-        self.R_columns = tuple(np.zeros((s.n_slopes, m), np.float32) for s in layout.sensors)
-        self.Q_columns = np.zeros((m, m), np.float32)
+        self.R = tuple(np.zeros((s.n_slopes, m), np.float32) for s in layout.sensors)
+        self.Q = np.zeros((m, m), np.float32)
+
+    def fill(self, R: Floats, Q: Floats) -> None:
+        """Copy R (n_commands, n_slopes) and Q in."""
+        start = 0
+        for columns in self.R:
+            np.copyto(columns, R[:, start : start + len(columns)].T)
+            start += len(columns)
+        np.copyto(self.Q, Q.T)
+
+    def times(self, slopes: Floats) -> Floats:
+        """``R slopes`` (n_commands,), sensor by sensor; a new array."""
+        out, part, start = np.zeros(len(self.Q), np.float32), np.empty(len(self.Q), np.float32), 0
+        for columns in self.R:
+            multiply(columns, slopes[start : start + len(columns)], part)
+            out += part
+            start += len(columns)
+        return out
+
+    def warm(self) -> None:
+        """Touch every byte."""
+        self.times(np.zeros(sum(map(len, self.R)), np.float32))
+        multiply(self.Q, np.zeros(len(self.Q), np.float32), np.empty(len(self.Q), np.float32))
+
+
+class Slot:
+    """Memory for one reconstructor. Made once, filled off the loop.
+
+    Attributes:
+        n_epochs: of the reconstructor in it.
+        epochs: matrices of each epoch that there is room for, the newest exposure first.
+        fallback: for the newest exposure alone; the first epoch's where there is room for no more.
+    """
+
+    def __init__(self, layout: Layout, max_epochs: int = 1) -> None:
+        m = layout.n_commands
+        self.n_epochs = 1
+        self.epochs = tuple(Columns(layout) for _ in range(max_epochs))
+        self.fallback = Columns(layout) if max_epochs > 1 else self.epochs[0]
         self.slope_reference = np.zeros(layout.n_slopes, np.float32)
         self.command_limit = np.zeros(m, np.float32)
         self.gain = 0.0
@@ -95,12 +149,16 @@ class Slot:
         self.sha256 = bytes(32)
 
     def fill(self, reconstructor: Reconstructor) -> None:
-        """Copy a checked static reconstructor in. Not on the loop's thread, and never into a slot in use."""
-        start = 0
-        for columns in self.R_columns:
-            np.copyto(columns, reconstructor.R[0, :, start : start + len(columns)].T)
-            start += len(columns)
-        np.copyto(self.Q_columns, reconstructor.Q[0].T)
+        """Copy a checked reconstructor in. Not on the loop's thread, and never into a slot in use.
+
+        Raises:
+            ValueError: it has more epochs than there is room for.
+        """
+        if reconstructor.n_epochs > len(self.epochs):
+            raise ValueError(f"uses {reconstructor.n_epochs} exposures; there is room for {len(self.epochs)}")
+        self.n_epochs = reconstructor.n_epochs
+        for columns, (R, Q) in zip((*self.epochs[: self.n_epochs], self.fallback), reconstructor.parts, strict=False):
+            columns.fill(R, Q)
         self.slope_reference[:] = reconstructor.slope_reference
         self.command_limit[:] = reconstructor.command_limit
         self.gain = reconstructor.gain
@@ -123,20 +181,17 @@ class Program:
         self.relaxation = np.float32(settings.relaxation)
         self.limit = np.minimum(slot.command_limit, np.float32(settings.command_limit))
         reference = settings.slope_reference + slot.slope_reference
-        self.reference = np.zeros_like(settings.offset)
-        part = np.empty_like(self.reference)
-        start = 0
-        for columns in slot.R_columns:
-            multiply(columns, reference[start : start + len(columns)], part)
-            self.reference += part
-            start += len(columns)
+        self.several = slot.n_epochs > 1
+        self.alone = slot.fallback if self.several else slot.epochs[0]
+        self.alone_reference = self.alone.times(reference)
+        self.reference = np.zeros_like(self.alone_reference)
+        for columns in slot.epochs[: slot.n_epochs]:
+            self.reference += columns.times(reference)
 
     def warm(self) -> None:
         """Touch every byte that a frame reads: the first product with a cold matrix takes 2-3 times as long."""
-        out = np.empty_like(self.reference)
-        for columns in self.slot.R_columns:
-            multiply(columns, np.zeros(len(columns), np.float32), out)
-        multiply(self.slot.Q_columns, np.zeros(len(out), np.float32), out)
+        for columns in {*self.slot.epochs[: self.slot.n_epochs], self.alone}:
+            columns.warm()
 
 
 _JIT: dict[str, Any] = {"nogil": True, "cache": True, "fastmath": False}
@@ -147,6 +202,12 @@ def _state_on_mirror(newest: Floats, before: Floats, fraction: float, offset: Fl
     rest = np.float32(1.0) - fraction
     for i in range(len(out)):
         out[i] = (fraction * newest[i] + rest * before[i]) - offset[i]
+
+
+@numba.njit("void(f4[::1], f4[::1])", **_JIT)
+def _add(part: Floats, out: Floats) -> None:
+    for i in range(len(out)):
+        out[i] += part[i]
 
 
 @numba.njit("void(f4[::1], f4[::1], f4[::1], f4, f4, f4[::1])", **_JIT)
@@ -207,21 +268,36 @@ class Loop:
         command: (n_commands,) the last answer m, m of wavefront.
         state: (n_commands,) u after it.
         closed: whether the loop is closed for the next frame.
+        max_epochs: exposures that a reconstructor may use.
         program: what the next frame is made with; None before the first one.
         n_clipped, mirror_frame, mirror_frame_before, mirror_fraction: of the last answer, as in DmCommand.
     """
 
-    def __init__(self, layout: Layout, delay: float) -> None:
-        """Allocate everything. ``delay``: mid-exposure to mid-command, frames, at least 1."""
-        if not 1 <= delay < HISTORY - 1:
-            raise ValueError(f"delay: expected 1 to {HISTORY - 2} frames, got {delay}")
+    def __init__(self, layout: Layout, delay: float, max_epochs: int = 1) -> None:
+        """Allocate everything.
+
+        Args:
+            delay: mid-exposure to mid-command, frames, at least 1.
+            max_epochs: exposures that a reconstructor may use, 1 to :data:`MAX_EPOCHS`.
+        """
+        if not 1 <= delay < HISTORY - 1 - MAX_EPOCHS:
+            raise ValueError(f"delay: expected 1 to {HISTORY - 2 - MAX_EPOCHS} frames, got {delay}")
+        if not 1 <= max_epochs <= MAX_EPOCHS:
+            raise ValueError(f"max_epochs: expected 1 to {MAX_EPOCHS}, got {max_epochs}")
+        self.max_epochs = max_epochs
         self.delay = float(np.float32(delay))  # as it travels in events
         self._whole = math.floor(self.delay)
         self._fraction = 1.0 - (self.delay - self._whole)
         n_sensors, m = len(layout.sensors), layout.n_commands
         self.n_sensors = n_sensors
         self.all_sensors = (1 << n_sensors) - 1
-        self._slopes = tuple(np.zeros(s.n_slopes, np.float32) for s in layout.sensors)
+        # by exposure: frame k is in row k % max_epochs
+        self._slopes = np.zeros((max_epochs, layout.n_slopes), np.float32)
+        self._slopes_of = tuple(tuple(row[layout.slopes_of(w)] for w in range(n_sensors)) for row in self._slopes)
+        self._kept = np.full(max_epochs, _NEVER, np.int64)  # the frame, if it was answered OK
+        # what was on the mirror, as in DmCommand
+        self._mirror_frames = np.full((max_epochs, 2), -1, np.int64)
+        self._mirror_fraction = np.ones(max_epochs, np.float32)
         self._parts = np.zeros((n_sensors, m), np.float32)
         self._part_of = tuple(self._parts[w] for w in range(n_sensors))
         self._history = np.zeros((HISTORY, m), np.float32)
@@ -229,6 +305,9 @@ class Loop:
         self._flat = np.zeros(m, np.float32)
         self._on_mirror = np.zeros(m, np.float32)
         self._q = np.zeros(m, np.float32)
+        self._product = np.zeros(m, np.float32)
+        self._older = np.zeros(m, np.float32)
+        self._several = False
         self._prepared = np.zeros(m, np.float32)
         self._trial = np.zeros(m, np.float32)
         self.command = np.zeros(m, np.float32)
@@ -244,7 +323,13 @@ class Loop:
     # -- from any thread --------------------------------------------------------------------------------------------
 
     def post(self, program: Program) -> None:
-        """Use ``program`` from the next frame that :meth:`prepare` prepares. Any thread: one reference is stored."""
+        """Use ``program`` from the next frame that :meth:`prepare` prepares. Any thread: one reference is stored.
+
+        Raises:
+            ValueError: it uses more exposures than the loop remembers.
+        """
+        if program.slot.n_epochs > self.max_epochs:
+            raise ValueError(f"uses {program.slot.n_epochs} exposures; this loop takes {self.max_epochs}")
         self._posted = program
 
     def request(self, closed: bool) -> None:
@@ -274,12 +359,27 @@ class Loop:
         self.n_clipped = 0
         self.state[:] = 0
         self._history[:] = 0
+        self._kept[:] = _NEVER
+        self._several = False
         self._expect_in_time()
 
     def resume(
-        self, frame: int, first_frame: int, state: Floats, history: Floats, closed: bool, consecutive_holds: int
+        self,
+        frame: int,
+        first_frame: int,
+        state: Floats,
+        history: Floats,
+        closed: bool,
+        consecutive_holds: int,
+        exposures: Mapping[int, tuple[Sequence[Floats], tuple[int, int, float]]] | None = None,
     ) -> None:
-        """Continue after ``frame`` with a recorded state; ``history`` rows end with ``frame``. Not while running."""
+        """Continue after ``frame`` with a recorded state. Not while running.
+
+        Args:
+            history: the commands up to that of ``frame``, the last row.
+            exposures: of earlier frames that were answered OK, by frame: the slopes of each sensor, and what was on the
+                mirror, as in DmCommand. Of more than ``max_epochs - 1`` only the newest matter.
+        """
         self.frame = frame + 1
         self.first_frame = first_frame
         self.closed = self._requested_closed = closed
@@ -287,6 +387,13 @@ class Loop:
         self.state[:] = state
         for row, command in enumerate(history[-HISTORY:], start=frame + 1 - len(history[-HISTORY:])):
             self._history[row % HISTORY] = command
+        self._kept[:] = _NEVER
+        for earlier, (slopes, mirror) in (exposures or {}).items():
+            if frame - self.max_epochs < earlier <= frame:
+                row = earlier % self.max_epochs
+                for own, values in zip(self._slopes_of[row], slopes, strict=True):
+                    own[:] = values
+                self._keep(row, earlier, *mirror)
         self.prepare()
 
     def prepare(self) -> None:
@@ -298,7 +405,51 @@ class Loop:
         if self._posted is not None:
             self.program, self._posted = self._posted, None
         self.closed = self._requested_closed and self.program is not None
+        self._form_older()
         self._expect_in_time()
+
+    def _form_older(self) -> None:
+        """Form the part of c that earlier exposures make, if the program uses them and all are here."""
+        program = self.program
+        self._several = program is not None and program.several and self._kept_back(program.slot.n_epochs - 1)
+        if program is None or not self._several:
+            return
+        self._older[:] = 0
+        for j in range(1, program.slot.n_epochs):
+            row = (self.frame - j) % self.max_epochs
+            columns = program.slot.epochs[j]
+            for w in range(self.n_sensors):
+                multiply(columns.R[w], self._slopes_of[row][w], self._product)
+                _add(self._product, self._older)
+            if program.settings.polc:
+                newest, before = self._mirror_frames[row]
+                self._product_with_mirror(columns.Q, newest, before, self._mirror_fraction[row], self._product)
+                _add(self._product, self._older)
+
+    def _kept_back(self, n: int) -> bool:
+        """Whether the ``n`` exposures before this one are kept."""
+        for frame in range(self.frame - n, self.frame):
+            if self._kept[frame % self.max_epochs] != frame:
+                return False
+        return True
+
+    def _keep(self, row: int, frame: int, newest: int, before: int, fraction: float) -> None:
+        self._kept[row] = frame
+        self._mirror_frames[row, 0] = newest
+        self._mirror_frames[row, 1] = before
+        self._mirror_fraction[row] = fraction
+
+    def _product_with_mirror(self, Q: Floats, newest: int, before: int, fraction: float, out: Floats) -> None:
+        """``Q u~`` with ``fraction`` of the exposure under command ``newest`` and the rest under ``before``."""
+        assert self.program is not None
+        _state_on_mirror(
+            self._shown(newest),
+            self._shown(before),
+            np.float32(fraction),
+            self.program.settings.offset,
+            self._on_mirror,
+        )
+        multiply(Q, self._on_mirror, out)
 
     def _expect_in_time(self) -> None:
         self._expect(self.frame - self._whole, self.frame - self._whole - 1, self._fraction)
@@ -311,27 +462,33 @@ class Loop:
         program = self.program
         if program is None:
             return
+        columns = program.slot.epochs[0] if self._several else program.alone
         if program.settings.polc:
-            _state_on_mirror(
-                self._shown(newest), self._shown(before), np.float32(fraction), program.settings.offset, self._on_mirror
-            )
-            multiply(program.slot.Q_columns, self._on_mirror, self._q)
+            self._product_with_mirror(columns.Q, newest, before, fraction, self._q)
         else:
             self._q[:] = 0
-        _prepared(self.state, self._q, program.reference, program.keep, program.gain, self._prepared)
+        reference = program.alone_reference
+        if self._several:
+            _add(self._older, self._q)
+            reference = program.reference
+        _prepared(self.state, self._q, reference, program.keep, program.gain, self._prepared)
 
     def _shown(self, frame: int) -> Floats:
         return self._history_of[frame % HISTORY] if frame >= self.first_frame else self._flat
 
     def _known(self, frame: int) -> bool:
-        return frame == -1 or max(self.first_frame, self.frame - HISTORY) <= frame < self.frame
+        # it still has to be known when this exposure is the oldest that is used, however many the loop takes
+        oldest = self.frame - HISTORY + MAX_EPOCHS
+        return frame == -1 or max(self.first_frame, oldest) <= frame < self.frame
 
     def add(self, sensor: int, slopes: Floats) -> None:
         """Take one sensor's slopes (n_slopes_w,) of the frame and form its product; they are copied."""
-        own = self._slopes[sensor]
+        own = self._slopes_of[self.frame % self.max_epochs][sensor]
         own[:] = slopes
-        if self.program is not None:
-            multiply(self.program.slot.R_columns[sensor], own, self._part_of[sensor])
+        program = self.program
+        if program is not None:
+            columns = program.slot.epochs[0] if self._several else program.alone
+            multiply(columns.R[sensor], own, self._part_of[sensor])
         self.sensors |= 1 << sensor
 
     def answer(self, mirror_frame: int, mirror_frame_before: int, mirror_fraction: float) -> Verdict:
@@ -340,9 +497,8 @@ class Loop:
         if not self.closed:
             return self._finish(Verdict.OPEN)
         assert self.program is not None
-        for slopes in self._slopes:
-            if not all_finite(slopes):
-                return self.hold(Verdict.HOLD_NONFINITE)
+        if not all_finite(self._slopes[self.frame % self.max_epochs]):
+            return self.hold(Verdict.HOLD_NONFINITE)
         if self.program.settings.polc and mirror_frame != MIRROR_UNKNOWN:
             if not (
                 self._known(mirror_frame)
@@ -379,6 +535,13 @@ class Loop:
                 self._requested_closed = False
                 self.opened_by_faults += 1
         self._history_of[self.frame % HISTORY][:] = self.command
+        self._keep(
+            self.frame % self.max_epochs,
+            self.frame if verdict is Verdict.OK else _NEVER,
+            self.mirror_frame,
+            self.mirror_frame_before,
+            self.mirror_fraction,
+        )
         self.verdict = verdict
         self.used = self.sensors
         self.answered = self.frame

@@ -48,7 +48,7 @@ from srtomo_core.system import InstrumentError, load_system
 from srtomo_rtc.events import EventKind, change_fields, event_fields, state_fields
 from srtomo_rtc.hot import HotEndpoints
 from srtomo_rtc.hrtc import Hrtc, Snapshot
-from srtomo_rtc.loop import Program, Settings
+from srtomo_rtc.loop import MAX_EPOCHS, Program, Settings
 from srtomo_rtc.swap import Manifest, Refused, Swap
 
 _ADOPTION_TIMEOUT = 2.0  # s for the loop to take up what was posted: it does between two frames, or at once if idle
@@ -80,6 +80,11 @@ _PARAMETERS: tuple[tuple[str, Any, ParameterDescriptor], ...] = (
     ("reconstructor", "", _read_only("path of a reconstructor to start with; empty: wait for one on the wire")),
     ("keep", "", _read_only("path where the last committed reconstructor is kept for a restart; empty: nowhere")),
     ("max_behind", 4, _integer("complete frames that may wait before whole frames are skipped", 1, 7, True)),
+    (
+        "max_epochs",
+        1,
+        _integer("exposures that a reconstructor may use; n above 1 take n+1 times the memory", 1, MAX_EPOCHS, True),
+    ),
     ("fifo_priority", 0, _integer("SCHED_FIFO priority of the process; 0: normal scheduling", 0, 99, True)),
     ("deadline", 0.0, _read_only("latency above which a frame is a miss, s; 0: the loop's delay less one exposure")),
     ("polc", True, ParameterDescriptor(description="pseudo-open-loop control; false: classical leaky integrator")),
@@ -209,7 +214,7 @@ class HrtcNode(LifecycleNode):
             command_limit=self._value("command_limit"),
             fault_budget=self._value("fault_budget"),
         )
-        swap = Swap(system, layout, G_cal, settings, self._post)
+        swap = Swap(system, layout, G_cal, settings, self._post, self._value("max_epochs"))
         loop = system.loop
         deadline = self._value("deadline") or max(loop.delay - 1, 0.1) / loop.rate
         hot = HotEndpoints(self._hot_node, wire.COMMAND.depth_at(loop.rate))
@@ -219,6 +224,7 @@ class HrtcNode(LifecycleNode):
             hot.publish,
             deadline_ns=int(deadline * 1e9),
             max_behind=self._value("max_behind"),
+            max_epochs=self._value("max_epochs"),
         )
         self._hot, self._swap, self._layout = hot, swap, layout
         try:
@@ -377,8 +383,7 @@ class HrtcNode(LifecycleNode):
                 held = swap.stage()
                 self._event(
                     EventKind.STAGED,
-                    f"{held.label}: stability {held.check.stability:.3f}, "
-                    f"scale {held.check.scale[0]:.2f} to {held.check.scale[1]:.2f}",
+                    f"{held.label}: {held.check}",
                     held.slot.sha256,
                 )
 

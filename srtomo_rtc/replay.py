@@ -16,13 +16,13 @@ import numpy as np
 
 from srtomo_core import wire
 from srtomo_core.bag import BagError, BagReader
+from srtomo_core.exposure import Exposure, fits, subaperture_starts
 from srtomo_core.layout import Layout
 from srtomo_core.messages import decode
-from srtomo_core.reconstructor import Reconstructor, ReconstructorError, block_table
+from srtomo_core.reconstructor import Reconstructor, ReconstructorError, block_table, n_parts
 from srtomo_core.system import System
 from srtomo_rtc.events import PROGRAM_KINDS, EventKind
-from srtomo_rtc.exposure import Exposure, fits, subaperture_starts
-from srtomo_rtc.loop import Loop, Program, Settings, Slot, Verdict
+from srtomo_rtc.loop import MAX_EPOCHS, Loop, Program, Settings, Slot, Verdict
 from srtomo_rtc.vmm import KERNEL
 
 _TIMED = (Verdict.HOLD_INCOMPLETE, Verdict.HOLD_MISSING, Verdict.HOLD_BEHIND)
@@ -85,6 +85,7 @@ class Replay:
         self.events: list[Any] = []
         self.states: dict[_Key, Any] = {}
         self._read_everything_but_frames()
+        self.max_epochs = max((slot.n_epochs for slot in self._slots.values()), default=1)
 
     # -- what is not a frame ----------------------------------------------------------------------------------------
 
@@ -121,30 +122,34 @@ class Replay:
         manifests = {}
         for data in self._of(wire.RECONSTRUCTOR):
             message = decode(wire.RECONSTRUCTOR.type, data)
-            if (message.n_epochs, message.n_commands, message.n_slopes) == (
-                1,
+            if (message.n_commands, message.n_slopes) == (
                 self.layout.n_commands,
                 self.layout.n_slopes,
-            ):
+            ) and 1 <= message.n_epochs <= MAX_EPOCHS:
                 manifests[bytes(message.sha256)] = message
-        table = block_table(self.layout.n_commands, 1)
         columns = (self.layout.n_slopes, self.layout.n_commands)
-        matrices = {sha256: [np.full((columns[1], n), np.nan, np.float32) for n in columns] for sha256 in manifests}
+        tables = {sha256: set(block_table(columns[1], message.n_epochs)) for sha256, message in manifests.items()}
+        matrices = {
+            sha256: [np.full((n_parts(message.n_epochs), columns[1], n), np.nan, np.float32) for n in columns]
+            for sha256, message in manifests.items()
+        }
         for data in self._of(wire.RECONSTRUCTOR_BLOCK):
             try:
                 block = wire.read_block(data)
             except wire.WireError:
                 continue
             place = (block.epoch, block.matrix, block.first_row, len(block.rows))
-            if block.sha256 in manifests and place in table and block.rows.shape[1] == columns[block.matrix]:
-                matrices[block.sha256][block.matrix][block.first_row : block.first_row + len(block.rows)] = block.rows
+            if place in tables.get(block.sha256, ()) and block.rows.shape[1] == columns[block.matrix]:
+                rows = slice(block.first_row, block.first_row + len(block.rows))
+                matrices[block.sha256][block.matrix][block.epoch, rows] = block.rows
         for sha256, message in manifests.items():
             R, Q = matrices[sha256]
             try:
-                reconstructor = Reconstructor(
+                reconstructor = Reconstructor.from_parts(
+                    message.n_epochs,
+                    R,
+                    Q,
                     fingerprint=bytes(message.fingerprint),
-                    R=R[None],
-                    Q=Q[None],
                     gain=message.gain,
                     slope_reference=message.slope_reference,
                     command_limit=message.command_limit,
@@ -237,7 +242,7 @@ def _name(verdict: int) -> str:
 
 
 def _filled(layout: Layout, reconstructor: Reconstructor) -> Slot:
-    slot = Slot(layout)
+    slot = Slot(layout, reconstructor.n_epochs)
     slot.fill(reconstructor)
     return slot
 
@@ -270,7 +275,8 @@ class _Session:
         self._session = session
         self._start = start
         self._outcome = outcome
-        self._loop = Loop(replay.layout, replay.system.loop.delay)
+        self._loop = Loop(replay.layout, replay.system.loop.delay, replay.max_epochs)
+        self._past: dict[int, tuple[Exposure | None, wire.DmCommand]] = {}
         self._timeline = _timeline(replay.events, session)
         self._next = 0
         self._in_step = False
@@ -284,6 +290,7 @@ class _Session:
     def advance(self, until: int, frames: dict[_Key, Exposure], answers: dict[_Key, wire.DmCommand]) -> None:
         """Replay every frame up to ``until``, and forget it."""
         while self._frame <= until:
+            self._remember(frames, answers)
             key = self._session, self._frame
             exposure, command = frames.pop(key, None), answers.pop(key, None)
             self._reach()
@@ -296,10 +303,40 @@ class _Session:
                 self._answer(exposure, command)
             if command is not None and not self._in_step:
                 self._skip()
+            if command is not None:
+                self._past[self._frame] = exposure, command
             self._frame = self._frame + 1 if self._in_step else min(until + 1, self._next_known(frames, answers))
+        self._remember(frames, answers)
         # slopes that came again after their answer, or before the first
         for key in [key for key in frames if key[0] == self._session and key[1] < self._frame]:
             del frames[key]
+
+    def _remember(self, frames: dict[_Key, Exposure], answers: dict[_Key, wire.DmCommand]) -> None:
+        """Keep the exposures just before this frame with their answers: a loop that is resumed may use them."""
+        first = self._frame - self._replay.max_epochs + 1
+        for frame in range(first, self._frame):
+            command = answers.pop((self._session, frame), None)
+            if command is not None:
+                self._past[frame] = frames.get((self._session, frame)), command
+        for frame in [frame for frame in self._past if frame < first]:
+            del self._past[frame]
+
+    def _exposures(self, frame: int, first_frame: int, n: int) -> dict[int, tuple[Any, tuple[int, int, float]]] | None:
+        """Up to ``n`` exposures that end with ``frame`` and were all answered OK; None if the bag lacks one of them."""
+        found: dict[int, tuple[Any, tuple[int, int, float]]] = {}
+        for earlier in range(frame, max(frame - n, first_frame - 1), -1):
+            exposure, command = self._past.get(earlier, (None, None))
+            if command is None:
+                return None
+            if command.verdict != Verdict.OK:
+                break
+            if exposure is None or exposure.arrived != self._loop.all_sensors:
+                return None
+            found[earlier] = (
+                exposure.slopes,
+                (command.mirror_frame, command.mirror_frame_before, command.mirror_fraction),
+            )
+        return found
 
     def _next_known(self, *recorded: dict[_Key, Any]) -> int:
         """The next frame of which anything is known; a count that jumps far is not walked along."""
@@ -340,7 +377,7 @@ class _Session:
     def _begin(self, entry: _Entry) -> None:
         if entry.frame != self._frame:
             return  # the replay starts after it
-        self._loop = Loop(self._replay.layout, entry.event.delay)
+        self._loop = Loop(self._replay.layout, entry.event.delay, self._replay.max_epochs)
         self._loop.start(entry.frame, closed=bool(entry.event.loop_state))
         self._in_step = True
         if entry.program is not None:
@@ -367,13 +404,18 @@ class _Session:
             ):
                 running = event
         self._next = sum(entry.frame <= frame for entry in self._timeline)
-        self._loop = Loop(self._replay.layout, delay)
+        self._loop = Loop(self._replay.layout, delay, self._replay.max_epochs)
         self._in_step = True
         if state.reconstructor and running is None:
             self._lose(f"Settings and reconstructor in use at frame {frame} are not in the bag.")
         elif state.reconstructor:
             self._run(running)
-        if self._in_step:
+        exposures = self._exposures(frame, int(state.first_frame), self._replay.max_epochs - 1)
+        if exposures is None:
+            self._lose(
+                f"Exposures before frame {frame + 1}, of which a reconstructor uses several, are not in the bag."
+            )
+        if self._in_step and exposures is not None:
             history = np.asarray(state.history, np.float32).reshape(int(state.n_frames), -1)
             self._loop.resume(
                 frame,
@@ -382,6 +424,7 @@ class _Session:
                 history,
                 bool(state.loop_state),
                 int(state.consecutive_holds),
+                exposures,
             )
 
     def _answer(self, exposure: Exposure | None, command: wire.DmCommand) -> None:

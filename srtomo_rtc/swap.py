@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from scipy.sparse.linalg import ArpackError, eigs
 
 from srtomo_core.layout import Layout
-from srtomo_core.reconstructor import Reconstructor, ReconstructorError, block_table
+from srtomo_core.reconstructor import Reconstructor, ReconstructorError, block_table, n_parts
 from srtomo_core.system import System
 from srtomo_core.wire import ReconstructorBlock
 from srtomo_rtc.loop import Program, Settings, Slot
@@ -28,12 +28,17 @@ from srtomo_rtc.loop import Program, Settings, Slot
 Floats = NDArray[np.float32]
 
 STABILITY_LIMIT = 0.8
-"""A reconstructor whose spectral radius of ``Q - R G_cal`` is not below this is refused."""
+"""A reconstructor whose spectral radius of ``Q - R G_cal`` (see :func:`stability`) is not below this is refused."""
 
 SCALE_LIMITS = (0.5, 1.2)
-"""Where ``v.(R G_cal v) / v.v`` must lie for smooth, seen shapes v: a wrong sign or scale is refused."""
+"""Where ``w.(G_cal R w) / w.w`` must lie for the slopes w = G_cal v of smooth, seen shapes v of each mirror.
+
+A wrong sign or scale is refused. In slopes, not in commands: with several mirrors a shape may rightly come back on
+others that look the same to the sensors.
+"""
 
 _SMOOTH_SHAPES = 20
+_ANGLES = 4  # a half circle and an epoch after the first
 _PROBE_TOLERANCE = 1e-3
 
 
@@ -66,10 +71,26 @@ class Manifest:
 
 @dataclass(frozen=True)
 class Check:
-    """The numbers of a passed check: ``stability`` is rho(Q - R G_cal), ``scale`` the range of v.(R G_cal v)/v.v."""
+    """The numbers of a passed check.
+
+    Attributes:
+        stability: :func:`stability`, of the fallback too: the larger one.
+        scale: range of ``w.(G_cal R w) / w.w`` for the slopes w of smooth shapes, R summed over the epochs, and of the
+            fallback's; NaN where no mirror is seen.
+        unseen: names of mirrors that no sensor sees, whose sign and scale nothing here can tell.
+    """
 
     stability: float
     scale: tuple[float, float]
+    unseen: tuple[str, ...] = ()
+
+    def __str__(self) -> str:
+        text = f"stability {self.stability:.3f}"
+        if not math.isnan(self.scale[0]):
+            text += f", scale {self.scale[0]:.2f} to {self.scale[1]:.2f}"
+        if self.unseen:
+            text += f"; {', '.join(self.unseen)}: seen by no sensor, sign and scale not checked"
+        return text
 
 
 @dataclass(frozen=True)
@@ -86,8 +107,8 @@ class Held:
         return self.reconstructor.label
 
 
-def spectral_radius(matrix: NDArray[np.float64]) -> float:
-    """Largest absolute eigenvalue of a square matrix (Arnoldi; dense where that does not converge)."""
+def spectral_radius(matrix: NDArray[np.inexact]) -> float:
+    """Largest absolute eigenvalue of a square matrix, real or complex (Arnoldi; dense where that does not converge)."""
     if len(matrix) > 30:
         try:
             start = np.random.default_rng(0).standard_normal(len(matrix))
@@ -98,28 +119,61 @@ def spectral_radius(matrix: NDArray[np.float64]) -> float:
     return float(np.abs(np.linalg.eigvals(matrix)).max())
 
 
-def smooth_shapes(layout: Layout, tip_tilt: bool) -> NDArray[np.float64]:
-    """Low-order shapes of the mirrors, (n_shapes, n_commands): polynomials in x and y, orthonormal, without piston.
+def stability(mismatch: NDArray[np.float64]) -> float:
+    """The number below 1 that makes pseudo-open-loop control stable at every delay and gain.
 
-    They stand on the first mirror, whose commands alone make them; ``tip_tilt`` says whether some sensor sees those.
+    With ``E_j = Q_j - R_j G_cal`` the loop's own response is ``u[k] = (1-g) u[k-1] + g sum_j E_j u~[k-j]``. A mode that
+    grows or lasts, ``z^k`` with ``|z| >= 1``, needs an eigenvalue e of ``E(z) = sum_j E_j z^-j`` with
+    ``1 - (1-g)/z = g e d(z)``, where the delay's ``|d(z)| <= 1`` and the left side is at least g: so ``|e| >= 1``. The
+    spectral radius of E(z) outside the unit circle is nowhere larger than on it (it is subharmonic), so that the number
+    is its largest value there; of one epoch that is ``rho(Q - R G_cal)``. The sum of all E_j, z = 1, is not enough.
+    On the circle it is sampled at so many angles that a polynomial of that degree is at most 8 % larger in between.
+
+    Args:
+        mismatch: (n_epochs, n_commands, n_commands) E_j.
     """
-    mirror = layout.mirrors[0]
-    x, y = (mirror.actuators / np.abs(mirror.actuators).max()).T
-    powers = [(a, degree - a) for degree in range(9) for a in range(degree, -1, -1)]
-    polynomials = np.stack([x**a * y**b for a, b in powers[: _SMOOTH_SHAPES + 3]], axis=1)
-    q, _ = np.linalg.qr(polynomials)
-    unseen = 1 if tip_tilt else 3
-    shapes = np.zeros((q.shape[1] - unseen, layout.n_commands))
-    shapes[:, layout.commands_of(0)] = q.T[unseen:]
-    return shapes[:_SMOOTH_SHAPES]
+    degree = len(mismatch) - 1
+    if degree == 0:
+        return spectral_radius(mismatch[0])
+    angles = np.linspace(0, math.pi, _ANGLES * degree + 1)
+    return max(
+        spectral_radius(np.tensordot(np.exp(-1j * angle * np.arange(degree + 1)), mismatch, 1)) for angle in angles
+    )
 
 
-def check(reconstructor: Reconstructor, layout: Layout, G_cal: Floats, tip_tilt: bool) -> Check:
+def seen_low_orders(system: System, layout: Layout) -> tuple[bool, bool]:
+    """Whether some sensor sees overall tip-tilt; and focus, which one lenslet alone takes for a tilt."""
+    stars = [system.star_of(sensor) for sensor in system.sensors]
+    return any(star.tip_tilt == "seen" for star in stars), any(
+        star.focus == "seen" and place.n_valid > 1 for star, place in zip(stars, layout.sensors, strict=True)
+    )
+
+
+def smooth_shapes(layout: Layout, tip_tilt: bool, focus: bool = True, mirror: int = 0) -> NDArray[np.float64]:
+    """Low-order shapes of a mirror, (n_shapes, n_commands): polynomials in x and y, orthonormal, without piston.
+
+    Its commands alone make them; ``tip_tilt`` and ``focus`` say whether some sensor sees those: if not, the shapes are
+    orthogonal to them. At most a quarter as many as the mirror has actuators: more are not smooth.
+    """
+    place = layout.mirrors[mirror]
+    x, y = (place.actuators / np.abs(place.actuators).max()).T
+    tilts, quadratics = [x, y], [x * y, y * y, x * x + y * y]
+    higher = [x**a * y ** (degree - a) for degree in range(3, 7) for a in range(degree, -1, -1)]
+    unseen = [np.ones_like(x)] + ([] if tip_tilt else tilts) + ([] if focus else quadratics[2:])
+    seen = (tilts if tip_tilt else []) + (quadratics if focus else quadratics[:2]) + higher
+    q, _ = np.linalg.qr(np.stack([*unseen, *seen], axis=1))
+    n_shapes = min(_SMOOTH_SHAPES, len(x) // 4)
+    shapes = np.zeros((n_shapes, layout.n_commands))
+    shapes[:, layout.commands_of(mirror)] = q.T[len(unseen) : len(unseen) + n_shapes]
+    return shapes
+
+
+def check(reconstructor: Reconstructor, layout: Layout, G_cal: Floats, tip_tilt: bool, focus: bool = True) -> Check:
     """Check a whole reconstructor against the instrument's calibrated interaction matrix.
 
     Args:
-        G_cal: (n_slopes, n_commands), rad/m.
-        tip_tilt: whether some sensor sees overall tip-tilt.
+        G_cal: (n_slopes, n_commands), rad/m; 0 for mirrors that no sensor sees (multi-object correction in open loop).
+        tip_tilt, focus: whether some sensor sees these overall.
 
     Raises:
         Refused: with the reason.
@@ -129,48 +183,64 @@ def check(reconstructor: Reconstructor, layout: Layout, G_cal: Floats, tip_tilt:
             f"made for another instrument (fingerprint {reconstructor.fingerprint.hex()[:12]}, "
             f"this one is {layout.fingerprint.hex()[:12]})"
         )
-    if (reconstructor.n_epochs, reconstructor.n_commands, reconstructor.n_slopes) != (
-        1,
-        layout.n_commands,
-        layout.n_slopes,
-    ):
-        raise Refused(f"expected R of shape (1, {layout.n_commands}, {layout.n_slopes}), got {reconstructor.R.shape}")
+    shape = layout.n_commands, layout.n_slopes
+    if reconstructor.R.shape[1:] != shape:
+        raise Refused(f"expected R of shape {(reconstructor.n_epochs, *shape)}, got {reconstructor.R.shape}")
     if not 0 < reconstructor.gain <= 1:
         raise Refused(f"gain: expected above 0 and at most 1, got {reconstructor.gain:g}")
-    for name in ("R", "Q", "slope_reference", "probe_commands", "probe_slopes"):
-        if not np.isfinite(getattr(reconstructor, name)).all():
+    for name in ("R", "Q", "fallback_R", "fallback_Q", "slope_reference", "probe_commands", "probe_slopes"):
+        values = getattr(reconstructor, name)
+        if values is not None and not np.isfinite(values).all():
             raise Refused(f"{name}: holds values that are not finite")
     if not (reconstructor.command_limit > 0).all():
         raise Refused("command_limit: expected every limit above 0")
-    R = reconstructor.R[0]
-    Q = reconstructor.Q[0]
-    _check_probes(reconstructor, R, Q)
-    closed = R @ G_cal
-    shapes = smooth_shapes(layout, tip_tilt)
-    ratios = np.einsum("ij,ij->i", shapes, shapes @ closed.T.astype(np.float64))
-    low, high = float(ratios.min()), float(ratios.max())
-    if not SCALE_LIMITS[0] <= low <= high <= SCALE_LIMITS[1]:
+    seen = [bool(G_cal[:, layout.commands_of(i)].any()) for i in range(len(layout.mirrors))]
+    _check_probes(reconstructor, layout, seen)
+
+    mismatch = np.stack([Q - R @ G_cal for R, Q in reconstructor.parts]).astype(np.float64)
+    sums = [reconstructor.R.sum(axis=0)]
+    stabilities = [stability(mismatch[: reconstructor.n_epochs])]
+    if reconstructor.fallback_R is not None:
+        sums.append(reconstructor.fallback_R)
+        stabilities.append(stability(mismatch[reconstructor.n_epochs :]))
+    low = high = math.nan
+    if any(seen):
+        shapes = [smooth_shapes(layout, tip_tilt, focus, mirror) for mirror, some in enumerate(seen) if some]
+        slopes = np.concatenate(shapes).astype(np.float32) @ G_cal.T
+        power = np.einsum("ij,ij->i", slopes, slopes, dtype=np.float64)
+        ratios = [np.einsum("ij,ij->i", slopes, slopes @ R.T @ G_cal.T, dtype=np.float64) / power for R in sums]
+        low, high = float(np.min(ratios)), float(np.max(ratios))
+        if not SCALE_LIMITS[0] <= low <= high <= SCALE_LIMITS[1]:
+            raise Refused(
+                f"wrong sign or scale: of the slopes of smooth shapes, {low:.3g} to {high:.3g} is corrected, "
+                f"expected {SCALE_LIMITS[0]:g} to {SCALE_LIMITS[1]:g}"
+            )
+    if not max(stabilities) < STABILITY_LIMIT:
         raise Refused(
-            f"wrong sign or scale: v.(R G_cal v)/v.v of smooth shapes is {low:.3g} to {high:.3g}, "
-            f"expected {SCALE_LIMITS[0]:g} to {SCALE_LIMITS[1]:g}"
+            f"not stable enough: spectral radius of Q - R G_cal is {max(stabilities):.3f}, limit {STABILITY_LIMIT:g}"
         )
-    stability = spectral_radius((Q - closed).astype(np.float64))
-    if not stability < STABILITY_LIMIT:
-        raise Refused(
-            f"not stable enough: spectral radius of Q - R G_cal is {stability:.3f}, limit {STABILITY_LIMIT:g}"
-        )
-    return Check(stability, (low, high))
+    unseen = tuple(mirror.name for mirror, some in zip(layout.mirrors, seen, strict=True) if not some)
+    return Check(max(stabilities), (low, high), unseen)
 
 
-def _check_probes(reconstructor: Reconstructor, R: Floats, Q: Floats) -> None:
+def _check_probes(reconstructor: Reconstructor, layout: Layout, seen: list[bool]) -> None:
+    """Every Q belongs to its R, and is 0 for commands of mirrors that no sensor sees."""
     if len(reconstructor.probe_commands) == 0:
         raise Refused("probe_commands: expected at least one, to check that Q belongs to R")
-    through_r = reconstructor.probe_slopes @ R.T
-    through_q = reconstructor.probe_commands @ Q.T
-    error = float(np.linalg.norm(through_r - through_q))
-    scale = float(np.linalg.norm(through_r))
-    if not (scale > 0 and error <= _PROBE_TOLERANCE * scale):
-        raise Refused(f"Q is not R G: they differ by {error / scale if scale else math.inf:.2g} on probes")
+    for i, (R, Q) in enumerate(reconstructor.parts):
+        through_r = reconstructor.probe_slopes @ R.T
+        through_q = reconstructor.probe_commands @ Q.T
+        error = float(np.linalg.norm(through_r - through_q))
+        scale = float(np.linalg.norm(through_r))
+        for mirror, some in enumerate(seen):
+            if not some and Q[:, layout.commands_of(mirror)].any():
+                raise Refused(
+                    f"Q is not 0 for {layout.mirrors[mirror].name}, which no sensor sees: made for a closed loop"
+                )
+        # an older exposure may count for nothing, and so does the newest if no mirror is seen
+        may_be_zero = not any(seen) or 0 < i < reconstructor.n_epochs
+        if not (error <= _PROBE_TOLERANCE * scale and (scale > 0 or may_be_zero)):
+            raise Refused(f"Q is not R G: they differ by {error / scale if scale else math.inf:.2g} on probes")
 
 
 class Swap:
@@ -182,24 +252,33 @@ class Swap:
         settings: at the start.
         post: hands a Program to the loop (``Loop.post``), which must have taken it up before the next one is posted, or
             else run no frame before: slots are used again.
+        max_epochs: exposures that a reconstructor may use: the loop's. Three slots and a transfer have room for so many
+            and, with more than one, a fallback: ``4 (max_epochs + 1) n_commands (n_slopes + n_commands)`` floats.
 
     Raises:
         ValueError: G_cal is not of the instrument's shape.
     """
 
     def __init__(
-        self, system: System, layout: Layout, G_cal: Floats, settings: Settings, post: Callable[[Program], None]
+        self,
+        system: System,
+        layout: Layout,
+        G_cal: Floats,
+        settings: Settings,
+        post: Callable[[Program], None],
+        max_epochs: int = 1,
     ) -> None:
         if G_cal.shape != (layout.n_slopes, layout.n_commands):
             raise ValueError(f"G_cal: expected shape {(layout.n_slopes, layout.n_commands)}, got {G_cal.shape}")
         self._layout = layout
         self._G_cal = G_cal
-        self._tip_tilt = any(star.tip_tilt == "seen" for star in map(system.star_of, system.sensors))
+        self._sees_tip_tilt, self._sees_focus = seen_low_orders(system, layout)
         self._post = post
-        self._slots = [Slot(layout) for _ in range(3)]
+        self._max_epochs = max_epochs
+        self._slots = [Slot(layout, max_epochs) for _ in range(3)]
         self._manifest: Manifest | None = None
-        self._R = np.zeros((layout.n_commands, layout.n_slopes), np.float32)
-        self._Q = np.zeros((layout.n_commands, layout.n_commands), np.float32)
+        self._R = np.zeros((n_parts(max_epochs), layout.n_commands, layout.n_slopes), np.float32)
+        self._Q = np.zeros((n_parts(max_epochs), layout.n_commands, layout.n_commands), np.float32)
         self._table: list[tuple[int, int, int, int]] = []
         self._waiting: frozenset[int] = frozenset()
         self.settings = settings
@@ -222,8 +301,7 @@ class Swap:
                 f"made for another instrument (fingerprint {manifest.fingerprint.hex()[:12]}, "
                 f"this one is {layout.fingerprint.hex()[:12]})"
             )
-        if manifest.n_epochs != 1:
-            raise Refused(f"uses {manifest.n_epochs} exposures; this loop takes 1")
+        self._check_epochs(manifest.n_epochs)
         if (manifest.n_commands, manifest.n_slopes) != (layout.n_commands, layout.n_slopes):
             raise Refused(
                 f"expected {layout.n_commands} commands x {layout.n_slopes} slopes, "
@@ -248,7 +326,7 @@ class Swap:
         if manifest is None or block.sha256 != manifest.sha256 or block.number not in self._waiting:
             return False
         epoch, matrix, first, rows = self._table[block.number]
-        target = self._R if matrix == 0 else self._Q
+        target = (self._R if matrix == 0 else self._Q)[epoch]
         if (block.epoch, block.matrix, block.first_row, block.rows.shape) != (
             epoch,
             matrix,
@@ -279,10 +357,11 @@ class Swap:
         if manifest is None or self._waiting:
             raise Refused("no whole reconstructor has come")
         try:
-            reconstructor = Reconstructor(
+            reconstructor = Reconstructor.from_parts(
+                manifest.n_epochs,
+                self._R,
+                self._Q,
                 fingerprint=manifest.fingerprint,
-                R=self._R[None],
-                Q=self._Q[None],
                 gain=manifest.gain,
                 slope_reference=manifest.slope_reference,
                 command_limit=manifest.command_limit,
@@ -300,13 +379,18 @@ class Swap:
 
     def stage_whole(self, reconstructor: Reconstructor) -> Held:
         """As :meth:`stage`, for a reconstructor that is whole already (from a file)."""
-        result = check(reconstructor, self._layout, self._G_cal, self._tip_tilt)
+        self._check_epochs(reconstructor.n_epochs)
+        result = check(reconstructor, self._layout, self._G_cal, self._sees_tip_tilt, self._sees_focus)
         in_use = {id(held.slot) for held in (self.active, self.previous) if held is not None}
         slot = next(slot for slot in self._slots if id(slot) not in in_use)
         slot.fill(reconstructor)
         Program(slot, self.settings).warm()
         self.staged = Held(slot, result, reconstructor)
         return self.staged
+
+    def _check_epochs(self, n_epochs: int) -> None:
+        if not 1 <= n_epochs <= self._max_epochs:
+            raise Refused(f"uses {n_epochs} exposures; this loop takes {self._max_epochs} (parameter max_epochs)")
 
     def forget(self) -> None:
         """Give the transfer under way up."""

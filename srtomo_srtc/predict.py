@@ -6,7 +6,8 @@ shape is ``sum_j g (1-g)^j R s[k-d-j]``. Frozen flow turns every age of a slope 
     tr Sigma_phi - 2 tr(N R Sigma_s_phi) + tr(N R Sigma_ss R^T N^T) + g / (2-g) tr(N R Sigma_nn R^T N^T)
 
 needs no more than Sigma_s_phi averaged over the ages that the filter mixes, and Sigma_ss over their differences, the
-exposure's own length included. Both averages are Gauss quadratures for those very weights.
+exposure's own length included. Both averages are Gauss quadratures for those very weights. With several exposures,
+R s is ``sum_j R_j s[k-j]``: exposure j is j frames older, and the noise of i and j is correlated by ``(1-g)^|i-j|``.
 """
 
 from __future__ import annotations
@@ -18,8 +19,9 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import cho_factor, cho_solve, lu_factor, lu_solve
+from scipy.sparse.linalg import ArpackError, LinearOperator, aslinearoperator, eigs
 
 from srtomo_core.layout import Layout
 from srtomo_core.reconstructor import Reconstructor
@@ -158,7 +160,7 @@ class _Quadratic(NamedTuple):
 
     power: float
     still: Array  # (n_commands, n_slopes)
-    moving: Array
+    moving: list[Array]  # of each exposure
     gram: Array  # (n_commands, n_commands)
 
 
@@ -179,6 +181,7 @@ class Prediction:
         layout: Layout | None = None,
         *,
         lag: bool = True,
+        epochs: int = 1,
         progress: Callable[[str, float], None] = lambda stage, done: None,
     ) -> None:
         """Compute the covariances.
@@ -187,6 +190,7 @@ class Prediction:
             system: the true sky, stars, noise and loop.
             layout: where sensors and mirrors truly are; as in ``system`` when not given.
             lag: False supposes a sky that stands still.
+            epochs: consecutive exposures that a reconstructor may use.
             progress: called with the name of each stage and the share of the work done before it, 0 to 1.
 
         Raises:
@@ -204,24 +208,36 @@ class Prediction:
         targets = system.science.targets
         n_slopes, n_commands, n_points = self.layout.n_slopes, self.layout.n_commands, len(grid.x)
         require(
-            8.0 * (4 * n_slopes**2 + 3 * n_points * (n_points + n_slopes) + 4 * len(targets) * n_commands * n_slopes),
+            8.0
+            * (
+                (3 + epochs) * n_slopes**2
+                + (2 + epochs) * n_points * (n_points + n_slopes)
+                + 2 * (1 + epochs) * len(targets) * n_commands * n_slopes
+            ),
             f"prediction for {system.name}",
         )
         points = [footprints(grid.x, grid.y, t.position, math.inf, profile.heights) for t in targets]
-        longest = float(np.max(np.concatenate([ages.nodes, differences.nodes])))
+        frames = np.arange(epochs) / system.loop.rate
+        longest = float(frames[-1] + np.max(np.concatenate([ages.nodes, differences.nodes])))
         turbulence = Turbulence.covering(
             profile, [*points, *(s.nodes for s in sensors), *(carried(s.nodes, velocity, longest) for s in sensors)]
         )
 
         progress("slope covariance", 0.0)
         self._still = slope_covariance(turbulence, sensors)
-        self._moving = self._still
+        # E[s(t) s(t - l)^T] of filtered slopes, l in frames; a still sky has the same for all
+        self._moving = [self._still] * epochs
         if lag:
-            self._moving = weight_of_none * self._still
-            for n, (time, weight) in enumerate(zip(*differences, strict=True)):
-                progress("slope covariance", 0.1 + 0.4 * n / len(differences.nodes))
-                later = _lagged(turbulence, sensors, sensors_carried(sensors, velocity, time))
-                self._moving += weight * (later + later.T)
+            self._moving = []
+            for frame, apart in enumerate(frames):
+                progress("slope covariance", 0.5 * (0.1 + frame) / epochs)
+                self._moving.append(
+                    weight_of_none * (self._after(turbulence, sensors, apart) if frame else self._still)
+                )
+                for time, weight in zip(*differences, strict=True):
+                    later = self._after(turbulence, sensors, apart + time)
+                    before = self._after(turbulence, sensors, apart - time) if frame else later.T
+                    self._moving[frame] += weight * (later + before)
         self._noise = noise_covariance(system, self.layout, system.loop.gain)
         self._jitter = jitter(system, self.layout)
 
@@ -232,16 +248,21 @@ class Prediction:
             progress("wavefront covariance", 0.5 + 0.5 * n / len(targets))
             phase = wavefront_covariance(turbulence, seen, seen)
             still = slope_wavefront_covariance(turbulence, sensors, seen).T
-            moving = still
+            moving = [still] * epochs
             if lag:
-                moving = np.zeros_like(still)
-                for time, weight in zip(*ages, strict=True):
-                    then = sensors_carried(sensors, velocity, time)
-                    moving += weight * slope_wavefront_covariance(turbulence, then, seen).T
+                moving = [np.zeros_like(still) for _ in frames]
+                for of_exposure, older in zip(moving, frames, strict=True):
+                    for time, weight in zip(*ages, strict=True):
+                        then = sensors_carried(sensors, velocity, older + time)
+                        of_exposure += weight * slope_wavefront_covariance(turbulence, then, seen).T
             shapes = mirror_wavefronts(self.layout, grid.x, grid.y, target.position)
             high_order, tip_tilt, unmade = _over_pupil(grid, phase, still, moving, shapes)
             self._views.append(_View(target.position, target.weight / total, unmade + hidden, high_order, tip_tilt))
         progress("done", 1.0)
+
+    def _after(self, turbulence: Turbulence, sensors: list[Sightline], time: float) -> Array:
+        """Covariance (n_slopes, n_slopes) of slopes with those a ``time`` (s) before."""
+        return _lagged(turbulence, sensors, sensors_carried(sensors, winds(self.system), time))
 
     def best(self) -> Array:
         """R (n_commands, n_slopes) that leaves least of a still sky, tip-tilt included: what :func:`implicit` builds.
@@ -259,33 +280,45 @@ class Prediction:
         gram[np.diag_indices_from(gram)] += KAPPA * gram.trace() / len(gram)
         return cho_solve(cho_factor(gram), estimator(S, right.T, blind).T)
 
-    def budgets(self, R: Array, mismatch: Array | None = None) -> list[Budget]:
+    def budgets(self, R: ArrayLike, mismatch: Array | None = None) -> list[Budget]:
         """The residual of a reconstructor, towards each science direction.
 
         Args:
-            R: (n_commands, n_slopes) m/rad.
-            mismatch: (n_commands, n_commands) ``Q - R G`` where Q was not made with the true G. The loop then settles
-                where ``m = R s + mismatch m``; the sky is taken as slow against that, and noise as passed on by the
-                mean filter.
+            R: (n_commands, n_slopes), or (n_epochs, n_commands, n_slopes) with the newest exposure first, m/rad.
+            mismatch: (n_commands, n_commands) ``Q - R G`` where Q was not made with the true G, or of each exposure.
+                The loop then settles where ``m = R s + mismatch m``; the sky is taken as slow against that, and noise
+                as passed on by the mean filter.
 
         Raises:
-            ValueError: R has another shape than the instrument's.
+            ValueError: R has another shape than the instrument's, or more exposures than the prediction was made for.
         """
         expected = (self.layout.n_commands, self.layout.n_slopes)
         R = np.asarray(R, dtype=np.float64)
-        if R.shape != expected:
+        if R.shape[-2:] != expected or R.ndim not in (2, 3):
             raise ValueError(f"R: expected shape {expected}, got {R.shape}")
+        parts = [R] if R.ndim == 2 else list(R)
+        if len(parts) > len(self._moving):
+            raise ValueError(f"R: uses {len(parts)} exposures, the prediction is for {len(self._moving)}")
         if mismatch is not None:
-            R = lu_solve(lu_factor(np.eye(len(R)) - mismatch), R)
-        still = R @ self._still @ R.T
-        moving = still if self._moving is self._still else R @ self._moving @ R.T
-        shaken = R @ self._jitter
-        noise = (R @ self._noise) @ R.T + shaken @ shaken.T
+            own_part = mismatch.sum(axis=0) if mismatch.ndim == 3 else mismatch
+            factor = lu_factor(np.eye(len(own_part)) - own_part)
+            parts = [lu_solve(factor, part) for part in parts]
+        total = np.sum(parts, axis=0)
+        still = total @ self._still @ total.T
+        moving, noise = np.zeros_like(still), np.zeros_like(still)
+        for i, one in enumerate(parts):
+            for j, other in enumerate(parts[: i + 1]):
+                sky = other @ self._moving[i - j] @ one.T
+                filtered = (1 - self.system.loop.gain) ** (i - j)
+                own = filtered * ((other @ self._noise) @ one.T + (other @ self._jitter) @ (one @ self._jitter).T)
+                moving += sky if i == j else sky + sky.T
+                noise += own if i == j else own + own.T
 
         def variances(q: _Quadratic) -> tuple[float, float, float]:
+            explained = sum(float(np.vdot(part, cross)) for part, cross in zip(parts, q.moving))
             return (
-                q.power - 2 * float(np.vdot(R, q.still)) + float(np.vdot(q.gram, still)),
-                q.power - 2 * float(np.vdot(R, q.moving)) + float(np.vdot(q.gram, moving)),
+                q.power - 2 * float(np.vdot(total, q.still)) + float(np.vdot(q.gram, still)),
+                q.power - 2 * explained + float(np.vdot(q.gram, moving)),
                 float(np.vdot(q.gram, noise)),
             )
 
@@ -319,13 +352,13 @@ def jitter(system: System, layout: Layout) -> Array:
 
 
 def _over_pupil(
-    grid: PupilGrid, phase: Array, still: Array, moving: Array, shapes: Array
+    grid: PupilGrid, phase: Array, still: Array, moving: list[Array], shapes: Array
 ) -> tuple[_Quadratic, _Quadratic, float]:
     """High orders, tip-tilt, and the high orders that no command makes, from covariances at the pupil's points.
 
     Args:
         phase: (n_points, n_points) Sigma_phi.
-        still, moving: (n_points, n_slopes) Sigma_phi_s.
+        still, moving: (n_points, n_slopes) Sigma_phi_s, and that of each exposure.
         shapes: (n_points, n_commands) N.
     """
     root = np.sqrt(grid.weight)[:, None]
@@ -333,15 +366,21 @@ def _over_pupil(
     tilts = low[:, 1:]
     phase = root * phase * root.T
     shapes = root * shapes
-    seen, (still_tilts, moving_tilts) = tilts.T @ shapes, ((root * tilts).T @ cross for cross in (still, moving))
+    seen = tilts.T @ shapes
+    to_tilts = (root * tilts @ seen).T
     tip_tilt = _Quadratic(
-        float(np.trace(tilts.T @ phase @ tilts)), seen.T @ still_tilts, seen.T @ moving_tilts, seen.T @ seen
+        float(np.trace(tilts.T @ phase @ tilts)),
+        to_tilts @ still,
+        [to_tilts @ cross for cross in moving],
+        seen.T @ seen,
     )
     phase -= low @ (low.T @ phase)
     phase -= (phase @ low) @ low.T
     shapes -= low @ (low.T @ shapes)
     to_commands = (root * shapes).T
-    high_order = _Quadratic(float(np.trace(phase)), to_commands @ still, to_commands @ moving, shapes.T @ shapes)
+    high_order = _Quadratic(
+        float(np.trace(phase)), to_commands @ still, [to_commands @ cross for cross in moving], shapes.T @ shapes
+    )
     return high_order, tip_tilt, _unmade(phase, shapes)
 
 
@@ -379,19 +418,23 @@ def moved_mirrors(
 
 
 def mismatch(reconstructor: Reconstructor, G: Array) -> Array:
-    """``Q - R G``, (n_commands, n_commands): what pseudo-open-loop control gets wrong of the mirror's own part.
+    """``Q - R G`` of each exposure: what pseudo-open-loop control gets wrong of the mirror's own part.
 
     Args:
         G: (n_slopes, n_commands) the true interaction matrix, rad/m.
+
+    Returns:
+        (n_epochs, n_commands, n_commands).
     """
-    return reconstructor.Q[0].astype(np.float64) - reconstructor.R[0].astype(np.float64) @ G
+    return np.stack([Q.astype(np.float64) - R.astype(np.float64) @ G for R, Q in zip(reconstructor.R, reconstructor.Q)])
 
 
 class Stability(NamedTuple):
     """Of a loop whose mirrors are not where its reconstructor takes them to be.
 
     Attributes:
-        radius: spectral radius of ``Q - R G``; below 1 the loop is stable at every delay and gain.
+        radius: spectral radius of ``E(z) = sum_j (Q_j - R_j G) z^-j``, the largest for any z on the unit circle; below
+            1 the loop is stable at every delay and gain. Of one exposure simply that of ``Q - R G``.
         growth: factor by which the loop's slowest mode changes in a frame at the delay and gain given; above 1 it
             diverges.
     """
@@ -401,11 +444,19 @@ class Stability(NamedTuple):
 
 
 def stability(error: Array, gain: float, delay: float) -> Stability:
-    """Stability of ``u[k] = (1-g) u[k-1] + g E u~[k]`` for ``E = Q - R G`` (n_commands, n_commands).
+    """Stability of ``u[k] = (1-g) u[k-1] + g sum_j E_j u~[k-j]`` for ``E_j = Q_j - R_j G``.
 
-    Every eigenvalue of E makes a loop of its own; the poles are the roots z of
-    ``1 = (1-g) / z + g lambda ((1-f) z^-n + f z^-(n+1))`` with n + f the delay in frames.
+    Every eigenvalue of a single E makes a loop of its own; the poles are the roots z of
+    ``1 = (1-g) / z + g lambda ((1-f) z^-n + f z^-(n+1))`` with n + f the delay in frames. Of several, the poles are the
+    eigenvalues of the loop's transition matrix, and E(z) is looked at so closely that a polynomial of its degree is at
+    most 8 % larger in between.
+
+    Args:
+        error: (n_epochs, n_commands, n_commands) E_j, or one of them.
     """
+    if error.ndim == 3 and len(error) > 1:
+        return Stability(_radius_on_circle(error), _slowest(error, gain, delay))
+    error = error.reshape(error.shape[-2:])
     values = np.linalg.eigvals(error)
     whole = math.floor(delay)
     share = delay - whole
@@ -415,6 +466,42 @@ def stability(error: Array, gain: float, delay: float) -> Stability:
     poles[:, 0, whole - 1] += gain * (1 - share) * values
     poles[:, 0, whole] += gain * share * values
     return Stability(float(np.abs(values).max()), float(np.abs(np.linalg.eigvals(poles)).max()))
+
+
+_ANGLES = 4  # a half circle and an exposure after the first
+
+
+def _radius_on_circle(error: Array) -> float:
+    powers = np.arange(len(error))
+    angles = np.linspace(0, math.pi, _ANGLES * (len(error) - 1) + 1)
+    return max(_largest(aslinearoperator(np.tensordot(np.exp(-1j * angle * powers), error, 1))) for angle in angles)
+
+
+def _slowest(error: Array, gain: float, delay: float) -> float:
+    """Of the transition from (u[k-1], u[k-2], ...) to (u[k], u[k-1], ...)."""
+    n_epochs, n_commands, _ = error.shape
+    whole = math.floor(delay)
+    share = delay - whole
+    frames = whole + n_epochs
+
+    def step(before: Array) -> Array:
+        u = before.reshape(frames, n_commands)
+        shown = (1 - share) * u[whole - 1 : frames - 1] + share * u[whole:]
+        now = (1 - gain) * u[0] + gain * np.einsum("jab,jb->a", error, shown, optimize=True)
+        return np.concatenate([now, before.ravel()[:-n_commands]])
+
+    size = frames * n_commands
+    return _largest(LinearOperator((size, size), matvec=step, dtype=np.float64))
+
+
+def _largest(operator: LinearOperator) -> float:
+    """Largest absolute eigenvalue (Arnoldi; dense where that does not converge)."""
+    size = operator.shape[0]
+    start = np.random.default_rng(0).standard_normal(size).astype(operator.dtype)
+    try:
+        return float(np.abs(eigs(operator, k=4, v0=start, return_eigenvectors=False, tol=1e-6)).max())
+    except ArpackError:
+        return float(np.abs(np.linalg.eigvals(operator @ np.eye(size))).max())
 
 
 def misplaced(

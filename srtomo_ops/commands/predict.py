@@ -14,6 +14,7 @@ from srtomo_core.layout import Layout
 from srtomo_core.reconstructor import Reconstructor
 from srtomo_core.system import System, load_system
 from srtomo_core.units import ARCSEC
+from srtomo_ops.commands.reconstruct import add_keywords, keywords_of
 from srtomo_ops.options import add_json, add_system, assignments, changes_of, system_of, write_json
 from srtomo_ops.progress import Progress
 from srtomo_srtc.model import ground_prior
@@ -23,6 +24,7 @@ from srtomo_srtc.reconstructors import METHODS
 EXAMPLE = """examples:
   srtomo predict gnao_ltao_sr --set 'loop.rate=1 kHz'
   srtomo predict gnao_ltao_sr --reconstructor sr.npz --stability
+  srtomo predict gnao_ltao_sr --method predictive --with epochs=3
   srtomo predict mini --becomes 'atmosphere.layers.2.altitude=14 km' --becomes 'atmosphere.r0=12 cm' --over 30"""
 
 _TERMS = ("fitting", "tomography", "noise", "lag", "total", "tip_tilt")
@@ -41,6 +43,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--method", choices=sorted(METHODS), default="implicit", help="to build with (default: implicit)"
     )
+    add_keywords(parser, "srtomo reconstruct --help lists them")
     parser.add_argument("--stability", action="store_true", help="also the loop's margin against misplaced mirrors")
     parser.add_argument(
         "--becomes",
@@ -63,13 +66,15 @@ def main(options: argparse.Namespace) -> int:
     # the gain belongs to the reconstructor, which runs with its own
     system = system.with_changes({"loop.gain": reconstructor.gain})
     with Progress("prediction") as progress:
-        budgets = Prediction(system, progress=progress.stage).budgets(reconstructor.R[0])
+        prediction = Prediction(system, epochs=reconstructor.n_epochs, progress=progress.stage)
+    budgets = prediction.budgets(reconstructor.R)
     content: dict[str, Any] = {
         "system": system.name,
         "reconstructor": f"{reconstructor.id:016x}",
         "rate_hz": system.loop.rate,
         "delay_frames": system.loop.delay,
         "gain": system.loop.gain,
+        "epochs": reconstructor.n_epochs,
         "targets": [_in_nm(budget) for budget in budgets],
         "wfe_nm": 1e9 * mean_wfe(budgets),
     }
@@ -88,15 +93,15 @@ def _reconstructor(options: argparse.Namespace, system: System) -> Reconstructor
         reconstructor = Reconstructor.load(options.reconstructor)
         if reconstructor.fingerprint != Layout(system).fingerprint:
             raise ValueError(f"{options.reconstructor}: made for another instrument than {system.name}")
-        if reconstructor.n_epochs > 1:
-            raise ValueError(f"{options.reconstructor}: uses {reconstructor.n_epochs} exposures, expected 1")
         return reconstructor
     return _build(options, ground_prior(system) if options.prior == "ground" else system)
 
 
 def _build(options: argparse.Namespace, believed: System) -> Reconstructor:
     with Progress("reconstructor") as progress:
-        reconstructor, _ = METHODS[options.method](believed, label=options.prior, progress=progress.stage)
+        reconstructor, _ = METHODS[options.method](
+            believed, label=options.prior, progress=progress.stage, **keywords_of(options)
+        )
     return reconstructor
 
 
@@ -175,12 +180,12 @@ def _age(options: argparse.Namespace, system: System, end: System, old: Reconstr
     for share in np.linspace(0, 1, options.ages):
         sky = drifted(system, end, float(share))
         with Progress(f"age {share * options.over:.0f} min") as progress:
-            prediction = Prediction(sky, progress=progress.stage)
+            prediction = Prediction(sky, epochs=old.n_epochs, progress=progress.stage)
         new = old if share == 0 and options.prior == "file" and not options.reconstructor else _build(options, sky)
         row = {
             "age_min": float(share) * options.over,
-            "old_nm": 1e9 * mean_wfe(prediction.budgets(old.R[0])),
-            "new_nm": 1e9 * mean_wfe(prediction.budgets(new.R[0])),
+            "old_nm": 1e9 * mean_wfe(prediction.budgets(old.R)),
+            "new_nm": 1e9 * mean_wfe(prediction.budgets(new.R)),
         }
         print(f"{row['age_min']:10.1f} {row['old_nm']:12.1f} {row['new_nm']:12.1f}", flush=True)
         rows.append(row)

@@ -87,7 +87,7 @@ def test_blocks_are_all_rows(made):
     assert [len(b.rows) for b in blocks] == [64, 64, 2, 64, 64, 2]
     assert np.array_equal(np.concatenate([b.rows for b in blocks if b.matrix == 0]), made.R[0])
     assert np.array_equal(np.concatenate([b.rows for b in blocks if b.matrix == 1]), made.Q[0])
-    assert len(block_table(M, 3)) == 18
+    assert len(block_table(M, 3)) == 24  # and a fallback
 
 
 @pytest.mark.parametrize(
@@ -110,6 +110,58 @@ def test_shapes_that_do_not_fit(made, changes, reason):
 def test_matrices_that_do_not_fit():
     with pytest.raises(ReconstructorError, match="G: expected shape"):
         Reconstructor.from_matrices(R, G.T, fingerprint=FINGERPRINT, gain=0.5, command_limit=np.ones(M))
+
+
+# -- several epochs --------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def two() -> Reconstructor:
+    return Reconstructor.from_matrices(
+        np.stack([1.5 * R, -0.5 * R]), G, fingerprint=FINGERPRINT, gain=0.3, command_limit=np.ones(M), fallback=0.9 * R
+    )
+
+
+def test_every_part_has_its_q(two):
+    assert (two.n_epochs, two.n_commands, two.n_slopes) == (2, M, N)
+    assert len(two.parts) == 3
+    for factor, (part, q) in zip((1.5, -0.5, 0.9), two.parts):
+        assert part == pytest.approx(factor * R, rel=1e-6)
+        assert np.array_equal(q, (part.astype(float) @ G).astype("f4"))
+
+
+def test_the_fallback_is_part_of_the_digest(two):
+    content = b"srtomo-reconstructor-1" + FINGERPRINT + struct.pack("<III", 2, M, N) + struct.pack("<f", 0.3)
+    for array in (two.slope_reference, two.command_limit, two.R, two.Q, two.fallback_R, two.fallback_Q):
+        content += array.astype("<f4").tobytes()
+    assert two.sha256 == hashlib.sha256(content).digest()
+
+
+def test_blocks_of_all_parts_make_it_again(two):
+    R_parts, Q_parts = np.zeros((3, M, N)), np.zeros((3, M, M))
+    blocks = list(two.blocks())
+    assert [(b.epoch, b.matrix, b.first_row, len(b.rows)) for b in blocks] == block_table(M, 2)
+    for block in blocks:
+        (R_parts, Q_parts)[block.matrix][block.epoch, block.first_row : block.first_row + len(block.rows)] = block.rows
+    names = ("fingerprint", "gain", "slope_reference", "command_limit", "probe_commands", "probe_slopes")
+    again = Reconstructor.from_parts(2, R_parts, Q_parts, **{name: getattr(two, name) for name in names})
+    assert again.sha256 == two.sha256
+
+
+def test_a_fallback_belongs_to_several_epochs(made, two):
+    for name in ("fallback_R", "fallback_Q"):
+        with pytest.raises(ReconstructorError, match=f"{name}: expected with several epochs, and only then"):
+            replace(two, **{name: None})
+        with pytest.raises(ReconstructorError, match=f"{name}: expected shape"):
+            replace(two, **{name: np.ones((M, 3))})
+    with pytest.raises(ReconstructorError, match="fallback_R: expected with several epochs, and only then"):
+        replace(made, fallback_R=R, fallback_Q=made.Q[0])
+
+
+def test_a_file_of_several_epochs(two, tmp_path):
+    two.save(tmp_path / "two.npz", G)
+    again = Reconstructor.load(tmp_path / "two.npz")
+    assert again.sha256 == two.sha256 and np.array_equal(again.fallback_Q, two.fallback_Q)
 
 
 # -- files -----------------------------------------------------------------------------------------------------------

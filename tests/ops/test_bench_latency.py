@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from srtomo_core.exposure import Exposure, fits, subaperture_starts
 from srtomo_core.system import load_system
 from srtomo_core.wire import read_dm_command, read_slope_frame
 from srtomo_ops.bench import latency
 from srtomo_ops.bench.latency import ARRIVALS, PATH_TARGETS, TARGETS, Problem, Summary
 from srtomo_ops.cli import main
-from srtomo_rtc.exposure import Exposure, fits, subaperture_starts
 from srtomo_rtc.hrtc import Hrtc
 from srtomo_rtc.loop import Loop
 

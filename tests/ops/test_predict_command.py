@@ -62,3 +62,18 @@ def test_design_writes_numbers_and_figure(tmp_path: Path, capsys: pytest.Capture
     assert content["misalignment"][0]["shift_subaperture"] == 0
     assert figure.read_bytes().startswith(b"\x89PNG")
     assert "best" in capsys.readouterr().out
+
+
+def test_reconstruct_and_predict_with_several_exposures(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file, built, loaded = tmp_path / "two.npz", tmp_path / "built.json", tmp_path / "loaded.json"
+    keywords = ["--method", "predictive", "--with", "epochs=2", "--with", "wind_uncertainty=[1,1,2]"]
+    assert main(["reconstruct", "mini", *keywords, "-o", str(file)]) == 0
+    assert "286 slopes of 2 exposures" in capsys.readouterr().out
+    assert main(["predict", "mini", *keywords, "--json", str(built)]) == 0
+    assert main(["predict", "mini", "--reconstructor", str(file), "--stability", "--json", str(loaded)]) == 0
+    one, other = (json.loads(path.read_text()) for path in (built, loaded))
+    assert one["epochs"] == other["epochs"] == 2
+    assert one["wfe_nm"] == pytest.approx(other["wfe_nm"], rel=1e-6)
+    assert 0.05 < other["stability"]["shift_limit_any_delay"] <= other["stability"]["shift_limit_subaperture"] < 1
+    assert main(["predict", "mini", "--method", "predictive", "--with", "epochs=2.5"]) != 0
+    assert "--with epochs: expected a value such as in epochs=1, got 2.5" in capsys.readouterr().err

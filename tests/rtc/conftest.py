@@ -121,7 +121,8 @@ class Bench:
         self.hrtc = Hrtc(self.layout, self.delay, self._publish, **self._options)
         self.hrtc.start()
         settings = plain_settings(self.layout)
-        self.swap = Swap(self.mini.system, self.layout, self.mini.G, settings, self.hrtc.loop.post)
+        epochs = self.hrtc.loop.max_epochs
+        self.swap = Swap(self.mini.system, self.layout, self.mini.G, settings, self.hrtc.loop.post, epochs)
 
     # -- sensors ----------------------------------------------------------------------------------------------------
 

@@ -243,13 +243,146 @@ def test_a_program_is_taken_up_between_frames_only():
     assert loop.program is second
 
 
-def test_a_frame_allocates_nothing():
+# -- several exposures -------------------------------------------------------------------------------------------------
+
+R_OLDER = RNG.standard_normal((2, M, N)) * 2e-4 - 0.1 * np.linalg.pinv(G)
+
+
+def several(R, fallback, gain, settings=None, room=3):
+    made = Reconstructor.from_matrices(
+        R, G, fingerprint=LAYOUT.fingerprint, gain=gain, command_limit=LAYOUT.stroke, fallback=fallback
+    )
+    slot = Slot(LAYOUT, room)
+    slot.fill(made)
+    return Program(slot, settings or plain_settings())
+
+
+THREE = np.concatenate([R1[None], R_OLDER])
+
+
+@pytest.mark.parametrize("room", [3, 5])
+@pytest.mark.parametrize("delay", [1, 1.6, 3])
+def test_several_exposures_are_the_filter_of_their_sum_and_a_gap_that_of_the_newest_alone(delay, room):
+    """With the exact G, u[k] = (1-g) u[k-1] + g sum_j R_j s_atm[k-j] where the exposures before were all answered OK.
+
+    Through the beginning, a held frame, one that is not finite, an open loop, an offset, and swaps to one exposure and
+    to two, which cost no fallback.
+    """
+    gain = 0.6
+    offset = RNG.standard_normal(M) * 1e-7
+    pair = {"offset": offset.astype("f4"), "slope_reference": (-G @ offset).astype("f4")}
+    programs = {
+        0: several(THREE, R2, gain, room=room),
+        50: several(THREE, R2, gain, plain_settings(id=2, **pair), room=room),
+        60: program(R1, gain, plain_settings(id=2, **pair)),
+        70: several(0.9 * THREE[:2], R2, gain, plain_settings(id=2, **pair), room=room),
+    }
+    laws = {60: (R1[None], R1), 70: (0.9 * THREE[:2], R2)}
+    R, fallback = THREE, R2
+    loop, mirror = Loop(LAYOUT, delay, room), Mirror(delay)
+    u, fine, alone = np.zeros(M), 0, []
+    loop.request(closed=True)
+    for k in range(90):
+        if k in programs:
+            loop.post(programs[k])
+        if k in (30, 35):
+            loop.request(closed=k == 35)
+        R, fallback = laws.get(k, (R, fallback))
+        loop.prepare()
+        shape, timing = mirror.during(k)
+        y = SKY[k] - G @ shape
+        if k == 20:
+            y[7] = np.nan
+        feed(loop, y)
+        verdict = loop.hold(Verdict.HOLD_MISSING) if k == 10 else loop.answer(*timing)
+        if verdict is Verdict.OK:
+            several_used = fine >= len(R) - 1
+            terms = [R[j] @ SKY[k - j] for j in range(len(R))] if several_used else [fallback @ SKY[k]]
+            u = (1 - gain) * u + gain * np.sum(terms, axis=0)
+            fine += 1
+            if not several_used:
+                alone.append(k)
+        else:
+            fine = 0
+            u = u * 0.9 if verdict is Verdict.OPEN else u
+        mirror.shown[k] = loop.command.astype(float)
+        m = u + (offset if k >= 50 else 0)
+        assert loop.command == pytest.approx(m, abs=3e-5 * np.abs(m).max()), k
+    assert alone == [0, 1, 11, 12, 21, 22, 35, 36]
+
+
+def test_only_the_newest_exposure_waits_for_its_slopes():
+    """What older exposures make is formed before the slopes come: their matrices are not looked at any more."""
+    commands = []
+    for spoilt in (False, True):
+        loop = Loop(LAYOUT, 2, 3)
+        made = several(THREE, R2, 0.5)
+        close(loop, made)
+        for k in range(6):
+            if spoilt and k == 5:
+                for columns in (*made.slot.epochs[1:], made.slot.fallback):
+                    for matrix in (*columns.R, columns.Q):
+                        matrix[:] = np.nan
+            feed(loop, SKY[k])
+            loop.answer(*((k - 2, k - 3, 1.0) if k > 2 else (-1, -1, 1.0)))
+            if k < 5:
+                loop.prepare()
+        commands.append(loop.command.copy())
+    assert np.array_equal(*commands)
+
+
+def test_older_exposures_were_under_the_mirror_that_their_sensors_reported():
+    loop, gain = Loop(LAYOUT, 2, 3), 0.5
+    close(loop, several(THREE, R2, gain))
+    shown = {-1: np.zeros(M)}
+    u, on, held = np.zeros(M), -1, {}
+    for k in range(40):
+        if k % 7 != 3:  # otherwise the command of k-2 came late and the mirror kept what it had
+            on = max(k - 2, -1)
+        held[k] = SKY[k] - G @ shown[on]
+        feed(loop, held[k])
+        assert loop.answer(on, on - 1, 1.0) is Verdict.OK
+        u = (1 - gain) * u + gain * (np.einsum("jmn,jn->m", THREE, SKY[k - 2 : k + 1][::-1]) if k > 1 else R2 @ SKY[k])
+        shown[k] = loop.command.astype(float)
+        assert loop.command == pytest.approx(u, abs=2e-5 * np.abs(u).max())
+        loop.prepare()
+
+
+def test_an_integrator_of_several_exposures():
+    """Without POLC: u[k] = (1-leak) u[k-1] + g sum_j R_j (y[k-j] - y_ref)."""
+    gain, leak = 0.4, 0.02
+    reference = RNG.standard_normal(N).astype("f4") * np.float32(1e-7)
+    loop = Loop(LAYOUT, 2, 3)
+    close(loop, several(THREE, R2, gain, plain_settings(polc=False, leak=leak, slope_reference=reference)))
+    u = np.zeros(M)
+    for k in range(20):
+        feed(loop, SKY[k])
+        loop.answer(k - 2, k - 3, 1.0)
+        seen = [R2 @ (SKY[k] - reference)] if k < 2 else [THREE[j] @ (SKY[k - j] - reference) for j in range(3)]
+        u = (1 - leak) * u + gain * np.sum(seen, axis=0)
+        assert loop.command == pytest.approx(u, abs=2e-5 * np.abs(u).max())
+        loop.prepare()
+
+
+def test_more_exposures_than_there_is_room_for():
+    with pytest.raises(ValueError, match="uses 3 exposures; there is room for 2"):
+        several(THREE, R2, 0.5, room=2)
+    loop = Loop(LAYOUT, 2, 2)
+    with pytest.raises(ValueError, match="uses 3 exposures; this loop takes 2"):
+        loop.post(several(THREE, R2, 0.5))
+    for epochs in (0, 9):
+        with pytest.raises(ValueError, match="epochs: expected 1 to 8"):
+            Loop(LAYOUT, 2, epochs)
+
+
+@pytest.mark.parametrize("epochs", [1, 3])
+def test_a_frame_allocates_nothing(epochs):
     """No array, buffer or object that outlives a frame; and nothing as large as a vector even within one."""
     layout = Layout(load_system("gnao_ltao"))
-    slot = Slot(layout)
-    slot.gain, slot.command_limit[:] = 0.5, 1.0
+    slot = Slot(layout, epochs)
+    slot.gain, slot.command_limit[:], slot.n_epochs = 0.5, 1.0, epochs
     n, m = layout.n_slopes, layout.n_commands
-    loop = Loop(layout, 2)
+    loop = Loop(layout, 2, epochs)
     close(loop, Program(slot, Settings(id=1, offset=np.zeros(m, "f4"), slope_reference=np.zeros(n, "f4"))))
     slopes = [np.ones(s.n_slopes, "f4") for s in layout.sensors]
 
