@@ -29,13 +29,22 @@ def transmission(telescope: Telescope, x: Array, y: Array) -> Array:
     """Intensity transmission of the pupil, 0 or 1, at points in metres from the pupil's centre. Any shape."""
     radius = telescope.diameter / 2
     cx, cy = telescope.obscuration_centre
-    inside = np.hypot(x, y) <= radius
+    inside = _within(x, y, radius)
     if telescope.obscuration > 0:
-        inside &= np.hypot(x - cx, y - cy) > radius * telescope.obscuration
+        inside &= ~_within(x - cx, y - cy, radius * telescope.obscuration)
     for spider in telescope.spiders:
         c, s = np.cos(spider.angle), np.sin(spider.angle)
         inside &= (c * x + s * y < 0) | (np.abs(c * y - s * x) >= spider.width / 2)
     return inside.astype(np.float64)
+
+
+def _within(x: Array, y: Array, radius: float) -> NDArray[np.bool_]:
+    """``hypot(x, y) <= radius``, where only points at the edge need the function's care."""
+    square = x * x + y * y
+    within = np.asarray(square <= radius**2)
+    edge = np.abs(square - radius**2) < 1e-12 * radius**2
+    within[edge] = np.hypot(x[edge], y[edge]) <= radius
+    return within
 
 
 @dataclass(frozen=True)

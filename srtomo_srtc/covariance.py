@@ -3,7 +3,8 @@
 Wavefronts are correlated at nodes, and sparse gradient operators turn nodes into slopes, block by block, so that no
 covariance of nodes is ever whole. Node pairs go layer by layer, and stars at different distances, shifts and rotations
 need no case of their own; or they go through tables (:mod:`srtomo_srtc.lattice`), wherever these are exact, and with
-``fast`` also where they interpolate.
+``fast`` also where they interpolate: one table for a pair of sensors, one for each layer from a sensor to points that a
+science target is seen through.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from scipy import sparse
 
 from srtomo_srtc.atmosphere import CovarianceTable, Profile
 from srtomo_srtc.geometry import Footprints, SeenLattice
-from srtomo_srtc.lattice import PairTable, is_on_lattice
+from srtomo_srtc.lattice import Correlator, PairTable, is_on_lattice
 from srtomo_srtc.parallel import Progress, run, silent
 from srtomo_srtc.solve import SymmetricTiles
 
@@ -28,6 +29,8 @@ Array = NDArray[np.float64]
 Matrix = NDArray[np.floating]
 
 _CHUNK = 2**23  # entries of a block of nodes and slopes that are held at a time
+_LEAST = 1e-8  # weight that counts in float32, of the largest: 1e-7 shows in modes that the mirrors hardly make
+_TILE = 12  # points across: with fewer, products are slow; with more, a tile's points count in too many sums
 
 
 @dataclass(frozen=True)
@@ -67,10 +70,6 @@ class Turbulence:
         reach = float(np.hypot(x_span, y_span).max())
         return cls(profile.fractions, CovarianceTable.build(profile.r0, profile.outer_scale, reach))
 
-    def only(self, layers: slice) -> Turbulence:
-        """Some of the layers."""
-        return Turbulence(self.fractions[layers], self.table)
-
 
 def wavefront_covariance(turbulence: Turbulence, a: Footprints, b: Footprints) -> Array:
     """Covariance between wavefronts at two sets of points, less the constant C(0) that piston removal takes out.
@@ -78,14 +77,10 @@ def wavefront_covariance(turbulence: Turbulence, a: Footprints, b: Footprints) -
     Returns:
         (n_a, n_b) m^2.
     """
-    return np.asarray(_covariance(turbulence, a, b, np.float64), np.float64)
-
-
-def _covariance(turbulence: Turbulence, a: Footprints, b: Footprints, dtype: type[np.floating]) -> Matrix:
     table = turbulence.table
-    out = np.empty((a.x.shape[1], b.x.shape[1]), dtype)
+    out = np.empty((a.x.shape[1], b.x.shape[1]))
     inputs = (a.x, a.y, b.x, b.y, turbulence.fractions, table.values)
-    _sum_layers(*(np.ascontiguousarray(values, dtype) for values in inputs), dtype(1 / table.step), out)
+    _sum_layers(*(np.ascontiguousarray(values) for values in inputs), 1 / table.step, out)
     return out
 
 
@@ -142,15 +137,13 @@ def slope_wavefront_covariance(turbulence: Turbulence, sensors: Sequence[Sightli
 
 @dataclass(frozen=True)
 class Share:
-    """Wavefront at points of some layers, and what it counts in each of several weighted sums.
+    """Wavefront at points, and what it counts in each of several weighted sums.
 
     Attributes:
-        layers: of the profile, on which the points are.
-        points: on these layers.
+        points: on the profile's layers.
         weights: (n_points, n_sums).
     """
 
-    layers: slice
     points: Footprints
     weights: sparse.csr_array
 
@@ -166,11 +159,11 @@ def slope_products(
 ) -> Array:
     """Covariance of weighted sums of the wavefront with all slopes, ``sum over shares of weights^T Sigma_phi_s``.
 
-    Sigma_phi_s exists only for a stretch of points and one sensor at a time. Points that are near each other should
-    follow each other: then few sums have any weight in a stretch, and only those cost.
+    Sigma_phi_s exists only for a few neighbouring points and one sensor at a time: few sums have any weight in these,
+    and only those cost.
 
     Args:
-        fast: float32.
+        fast: float32, and tables wherever the sensor allows: wrong by less than 1e-5 of the norm.
 
     Returns:
         (n_sums, n_slopes).
@@ -178,24 +171,69 @@ def slope_products(
     starts = np.cumsum([0] + [sensor.gradient.shape[0] for sensor in sensors])
     dtype = np.float32 if fast else np.float64
     out = np.zeros((shares[0].weights.shape[1], starts[-1]), dtype)
+    orders, tiles = zip(*(_tiles(share, dtype) for share in shares), strict=True)
+    points = Footprints(
+        *(
+            np.hstack([getattr(share.points, axis)[:, order] for share, order in zip(shares, orders, strict=True)])
+            for axis in "xy"
+        )
+    )
+    begins = np.cumsum([0] + [len(order) for order in orders])
 
-    def add(sensor: Sightline, slopes: slice, share: Share) -> None:
-        layers, seen = turbulence.only(share.layers), sensor.only(share.layers)
+    def add(sensor: Sightline, slopes: slice) -> None:
+        correlate = _point_correlation(turbulence, sensor, points, fast)
         mine = out[:, slopes]
-        for points in _stretches(share.weights.shape[0], 4 * mine.shape[1]):
-            weights = share.weights[points]
-            sums, columns = np.unique(weights.indices, return_inverse=True)
-            dense = np.zeros((weights.shape[0], len(sums)), dtype)
-            dense[np.repeat(np.arange(weights.shape[0]), np.diff(weights.indptr)), columns] = weights.data
-            mine[sums] += dense.T @ _slopes_with_points(layers, seen, share.points, points, dtype).T
-
-    def add_all(sensor: Sightline, slopes: slice) -> None:
-        for share in shares:
-            add(sensor, slopes, share)
+        for begin, own in zip(begins, tiles):
+            for tile in own:
+                products = tile.weights @ correlate(slice(begin + tile.points.start, begin + tile.points.stop))
+                _add_rows(mine, tile.sums, products)
 
     slices = [slice(*pair) for pair in pairwise(starts)]
-    run([partial(add_all, *pair) for pair in zip(sensors, slices)], threads, progress)
+    run([partial(add, *pair) for pair in zip(sensors, slices)], threads, progress)
     return out
+
+
+@dataclass(frozen=True)
+class _Tile:
+    """Neighbouring points of a :class:`Share`.
+
+    Attributes:
+        points: where they are in the share's order of tiles.
+        sums: (n_sums,) those in which they count.
+        weights: (n_sums, n_points).
+    """
+
+    points: slice
+    sums: NDArray[np.integer]
+    weights: Matrix
+
+
+def _tiles(share: Share, dtype: type[np.floating]) -> tuple[NDArray[np.intp], list[_Tile]]:
+    """An order of a share's points in which they come tile by tile, and these tiles."""
+    # near each other on the lowest layer
+    x, y = share.points.x[0], share.points.y[0]
+    side = _TILE * np.sqrt(np.ptp(x) * np.ptp(y) / len(x))
+    column, row = (np.floor((values - values.min()) / side).astype(np.int64) for values in (x, y))
+    where = row * (column.max() + 1) + column
+    order = np.argsort(where, kind="stable")
+    bounds = [0, *(np.flatnonzero(np.diff(where[order])) + 1).tolist(), len(order)]
+    weights = share.weights[order]
+    least = _LEAST * abs(weights.data).max() if dtype is np.float32 else 0.0
+    tiles = []
+    for first, last in pairwise(bounds):
+        own = weights[first:last].tocoo()
+        counts = abs(own.data) > least
+        sums, rows = np.unique(own.col[counts], return_inverse=True)
+        dense = np.zeros((len(sums), last - first), dtype)
+        dense[rows, own.row[counts]] = own.data[counts]
+        tiles.append(_Tile(slice(first, last), sums, dense))
+    return order, tiles
+
+
+@numba.njit(cache=True, nogil=True)
+def _add_rows(out: Matrix, rows: NDArray[np.integer], values: Matrix) -> None:
+    for i in range(len(rows)):
+        out[rows[i]] += values[i]
 
 
 Correlate = Callable[[slice], Matrix]
@@ -211,16 +249,30 @@ def _node_correlation(turbulence: Turbulence, first: Sightline, second: Sightlin
             table = PairTable.build(
                 b.lattice, centres, b.cones, b.offsets - a.offsets, turbulence.fractions, turbulence.table
             )
-            return partial(table.slopes, second.gradient)
-    return lambda nodes: _slopes_with_points(turbulence, second, first.nodes, nodes, np.float64).T
+            return Correlator([table], second.gradient)
+    return _layer_by_layer(turbulence, second, first.nodes)
 
 
-def _slopes_with_points(
-    turbulence: Turbulence, sensor: Sightline, points: Footprints, stretch: slice, dtype: type[np.floating]
-) -> Matrix:
-    """(n_slopes, length of the stretch) rad m."""
-    some = Footprints(points.x[:, stretch], points.y[:, stretch])
-    return np.asarray(sensor.gradient.astype(dtype) @ _covariance(turbulence, sensor.nodes, some, dtype))
+def _point_correlation(turbulence: Turbulence, sensor: Sightline, points: Footprints, fast: bool) -> Correlate:
+    """Of any points with the sensor's slopes; with ``fast`` in float32, and from a table for each layer."""
+    seen = sensor.seen
+    if not fast or seen is None:
+        return _layer_by_layer(turbulence, sensor, points)
+    tables = []
+    for l, (cone, offset) in enumerate(zip(seen.cones, seen.offsets, strict=True)):
+        # where the rays from the star through the points meet the pupil
+        centres = seen.lattice.to_steps((points.x[l] - offset[0]) / cone, (points.y[l] - offset[1]) / cone)
+        one = np.array([cone]), np.zeros((1, 2)), turbulence.fractions[l : l + 1]
+        tables.append(PairTable.build(seen.lattice, centres, *one, turbulence.table, np.float32))
+    return Correlator(tables, sensor.gradient)
+
+
+def _layer_by_layer(turbulence: Turbulence, sensor: Sightline, points: Footprints) -> Correlate:
+    def correlate(stretch: slice) -> Matrix:
+        some = Footprints(points.x[:, stretch], points.y[:, stretch])
+        return np.asarray((sensor.gradient @ wavefront_covariance(turbulence, sensor.nodes, some)).T)
+
+    return correlate
 
 
 def _write_slopes(

@@ -16,6 +16,7 @@ from srtomo_core.layout import Layout
 from srtomo_core.system import Direction, System
 from srtomo_srtc.geometry import Footprints, footprints, pupil_grid
 from srtomo_srtc.mirrors import sparse_wavefronts
+from srtomo_srtc.solve import SymmetricTiles
 
 Array = NDArray[np.float64]
 
@@ -80,8 +81,10 @@ class Fit:
             modes = sparse_wavefronts(layout, self.grid.x, self.grid.y, target.position)
             view = View(target.position, target.weight / total, self.grid.weight, modes)
             _add_products(modes.indptr, modes.indices, modes.data, view.weight * view.light, self.normal)
-            self.normal -= view.weight * np.outer(view.pistons, view.pistons)
             self.views.append(view)
+        self.normal += np.tril(self.normal, -1).T
+        pistons = np.stack([view.pistons for view in self.views])
+        self.normal -= (pistons.T * [view.weight for view in self.views]) @ pistons
         self.ridge = kappa * float(self.normal.trace()) / len(self.normal)
         self.normal[np.diag_indices_from(self.normal)] += self.ridge
         self._factor = cho_factor(self.normal)
@@ -91,18 +94,27 @@ class Fit:
         for view in self.views:
             yield view, footprints(self.grid.x, self.grid.y, view.direction, math.inf, heights)
 
-    def solve(self, right: Array) -> Array:
-        """Commands (n_commands, n) from the right-hand side (n_commands, n) of the normal equations."""
-        return cho_solve(self._factor, right)
+    def solve(self, right: Array, threads: int = 1) -> Array:
+        """Commands (n_commands, n) from the right-hand side (n_commands, n) of the normal equations.
+
+        In the precision of ``right``, float64 or float32; in the latter on so many threads.
+        """
+        if right.dtype == np.float64:
+            return cho_solve(self._factor, right)
+        normal = SymmetricTiles.of(self.normal.astype(right.dtype))
+        normal.factor(threads)
+        commands = np.ascontiguousarray(right.T)
+        normal.divide(commands, threads)
+        return commands.T
 
 
 @numba.njit(cache=True, nogil=True)
 def _add_products(
     indptr: NDArray[np.integer], indices: NDArray[np.integer], data: Array, weight: Array, out: Array
 ) -> None:
-    """``out += N^T diag(weight) N``."""
+    """``out += N^T diag(weight) N``, lower half; the indices of each row of N ascend."""
     for p in range(len(weight)):
         for a in range(indptr[p], indptr[p + 1]):
             value, row = weight[p] * data[a], out[indices[a]]
-            for b in range(indptr[p], indptr[p + 1]):
+            for b in range(indptr[p], a + 1):
                 row[indices[b]] += value * data[b]

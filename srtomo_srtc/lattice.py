@@ -1,17 +1,19 @@
 """Covariance of the wavefront at one sensor's nodes with another sensor's slopes, from one table for all layers.
 
 Towards stars at the same range every layer's separation is ``xi_l b + h_l (alpha_i - alpha_j)``, with b the baseline in
-the pupil: the sum over the layers is a function of b alone, tabulated once for each pair of sensors.
+the pupil: the sum over the layers is a function of b alone, tabulated once for each pair of sensors. Points that are
+seen from another range take a table for each layer.
 
 A sensor's nodes are part of a square lattice. From one point to all of them the baselines differ by whole steps of
 that lattice: in a table whose grid divides the step, every node is as far beyond its grid point as the others, and one
 set of weights serves them all. Where the points lie on the lattice themselves (a sensor that is only shifted against
 the other), the grid is placed there, and a look-up is exact. Otherwise it interpolates by cubics in x and y on a
-quarter of the step.
+quarter of the step: nodes that follow each other in a row are then 12 vectors, weighted and summed.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numba
@@ -23,10 +25,12 @@ from srtomo_srtc.atmosphere import CovarianceTable
 from srtomo_srtc.geometry import Lattice
 
 Array = NDArray[np.float64]
+Matrix = NDArray[np.floating]
 Indices = NDArray[np.integer]
 
 _DIVISIONS = 4  # of the lattice's step, where a table is interpolated
-_COLUMNS = 16  # that are done at a time
+_COLUMNS = 8  # of which a row's length is a multiple: loops that leave no rest are quicker
+_POINTS = 48  # whose nodes are held at a time: as much as a cache holds
 _ON_LATTICE = 1e-7  # steps of the lattice: closer is on it
 
 
@@ -49,7 +53,14 @@ class PairTable:
 
     @classmethod
     def build(
-        cls, lattice: Lattice, centres: Array, cones: Array, offsets: Array, fractions: Array, table: CovarianceTable
+        cls,
+        lattice: Lattice,
+        centres: Array,
+        cones: Array,
+        offsets: Array,
+        fractions: Array,
+        table: CovarianceTable,
+        dtype: type[np.floating] = np.float64,
     ) -> PairTable:
         """Tabulate.
 
@@ -58,6 +69,7 @@ class PairTable:
             offsets: (n_layers, 2) x and y by which the sensor's footprint is displaced from that of the points, m.
             fractions: (n_layers,) of the layers.
             table: of the covariance.
+            dtype: of the values.
         """
         divisions, margin = (1, 1) if is_on_lattice(centres) else (_DIVISIONS, 3)
         nodes = np.stack([lattice.row, lattice.column], axis=1)
@@ -66,25 +78,42 @@ class PairTable:
         n_rows, n_columns = (last - first).astype(int) + 1
         if divisions == 1:
             first += -centres[0] % 1
-        values = np.zeros((divisions, divisions, n_rows, n_columns + _COLUMNS))
+        values = np.zeros((divisions, divisions, n_rows, n_columns + _COLUMNS), dtype)
         _tabulate(
             cones, offsets, fractions, lattice.step, lattice.rotation, table.values, 1 / table.step, first, values
         )
         return cls(lattice, centres, first, values)
 
-    def slopes(self, gradient: sparse.csr_array, points: slice) -> Array:
-        """Covariance of the wavefront at some of the points with the sensor's slopes.
+
+class Correlator:
+    """Covariance of the wavefront at points, summed over one or several tables, with a sensor's slopes.
+
+    The points of all tables are the same ones, on other layers.
+    """
+
+    def __init__(self, tables: Sequence[PairTable], gradient: sparse.csr_array) -> None:
+        """Set up.
 
         Args:
+            tables: for one sensor.
             gradient: (n_slopes, n_nodes) of the sensor, 1/m.
-
-        Returns:
-            (n_points, n_slopes) rad m.
         """
-        place = (-self.centres[points] - self.first) * len(self.values)
-        rows, where = self.lattice.rows(_COLUMNS)
-        out = np.empty((len(place), gradient.shape[0]))
-        _correlate(place, self.values, rows, gradient.indptr, where[gradient.indices], gradient.data, out)
+        self._tables = [((-t.centres - t.first) * len(t.values), t.values) for t in tables]
+        self._rows, where = tables[0].lattice.rows(_COLUMNS)
+        self._gradient = gradient.indptr, where[gradient.indices], gradient.data.astype(tables[0].values.dtype)
+
+    def __call__(self, points: slice) -> Matrix:
+        """Of some of the points: (n_points, n_slopes) rad m."""
+        every = range(*points.indices(len(self._tables[0][0])))
+        out = np.empty((len(every), len(self._gradient[0]) - 1), self._gradient[2].dtype)
+        nodes = np.empty((min(_POINTS, len(every)), self._rows[:, 2].sum()), out.dtype)
+        for start in range(0, len(every), _POINTS):
+            some = every[start : start + _POINTS]
+            own = nodes[: len(some)]
+            own[:] = 0
+            for place, values in self._tables:
+                _add_nodes(place[some.start : some.stop], values, self._rows, own)
+            _slopes(own, *self._gradient, out[start : start + _POINTS])
         return out
 
 
@@ -125,72 +154,82 @@ def _tabulate(
                         row[c] += fractions[l] * (table[i] + (t - i) * (table[i + 1] - table[i]))
 
 
-@numba.njit(cache=True, nogil=True, fastmath={"contract"})
-def _correlate(
-    place: Array, table: Array, rows: Indices, indptr: Indices, indices: Indices, data: Array, out: Array
-) -> None:
-    divisions, n_columns = table.shape[1], table.shape[3]
-    flat, per_phase = table.reshape(-1), table[0, 0].size
-    nodes = np.empty(rows[:, 2].sum())
-    weights = np.empty((2, 4))
-    start = np.empty(4, np.int64)
+@numba.njit(cache=True, nogil=True, fastmath={"contract", "reassoc"})
+def _add_nodes(place: Array, table: Matrix, rows: Indices, out: Matrix) -> None:
+    flat, n_columns = table.reshape(-1), table.shape[3]
+    starts, weights = _taps(place, table)
+    at = 0
+    # row by row for all points: near points look into the same part of the table, while it is in the cache
+    for k in range(len(rows)):
+        beyond, n = rows[k, 0] * n_columns + rows[k, 1], rows[k, 2]
+        for p in range(len(place)):
+            nodes, first, w = out[p, at : at + n], starts[p], weights[p]
+            if len(w) == 1:
+                nodes += flat[first[0] + beyond : first[0] + beyond + n]
+                continue
+            for i in range(0, 12, 6):
+                f0, f1, f2 = first[i] + beyond, first[i + 1] + beyond, first[i + 2] + beyond
+                f3, f4, f5 = first[i + 3] + beyond, first[i + 4] + beyond, first[i + 5] + beyond
+                t0, t1, t2 = flat[f0 : f0 + n], flat[f1 : f1 + n], flat[f2 : f2 + n]
+                t3, t4, t5 = flat[f3 : f3 + n], flat[f4 : f4 + n], flat[f5 : f5 + n]
+                w0, w1, w2, w3, w4, w5 = w[i], w[i + 1], w[i + 2], w[i + 3], w[i + 4], w[i + 5]
+                for c in range(n):
+                    nodes[c] += w0 * t0[c] + w1 * t1[c] + w2 * t2[c] + w3 * t3[c] + w4 * t4[c] + w5 * t5[c]
+        at += n
+
+
+@numba.njit(cache=True, nogil=True)
+def _taps(place: Array, table: Matrix) -> tuple[Indices, Matrix]:
+    """Where in the flat table what belongs to baseline 0 of each point is, and how much each entry counts.
+
+    Interpolated by cubics in x between the two rows next to it, and in y between the two columns, less what is in both.
+    """
+    divisions, n_columns, per_phase = table.shape[1], table.shape[3], table[0, 0].size
+    n = 1 if divisions == 1 else 12
+    starts, weights = np.empty((len(place), n), np.int64), np.ones((len(place), n), table.dtype)
+    wy, wx, ly, lx = np.empty(4), np.empty(4), np.zeros(4), np.zeros(4)
     for p in range(len(place)):
-        nodes[:] = 0.0
-        if divisions == 1:
-            base = np.int64(np.rint(place[p, 0])) * n_columns + np.int64(np.rint(place[p, 1]))
-            at = 0
-            for k in range(len(rows)):
-                _add(nodes, at, rows[k, 2], flat, base + rows[k, 0] * n_columns + rows[k, 1])
-                at += rows[k, 2]
-        else:
-            fy, fx = np.int64(np.floor(place[p, 0])), np.int64(np.floor(place[p, 1]))
-            _cubic(place[p, 0] - fy, weights[0])
-            _cubic(place[p, 1] - fx, weights[1])
-            for i in range(4):
-                y = fy + i - 1
-                for j in range(4):
-                    x = fx + j - 1
+        if n == 1:
+            starts[p, 0] = np.int64(np.rint(place[p, 0])) * n_columns + np.int64(np.rint(place[p, 1]))
+            continue
+        fy, fx = np.int64(np.floor(place[p, 0])), np.int64(np.floor(place[p, 1]))
+        _cubic(place[p, 0] - fy, wy, ly)
+        _cubic(place[p, 1] - fx, wx, lx)
+        tap = 0
+        for i in range(4):
+            for j in range(4):
+                if i in (1, 2) or j in (1, 2):
+                    y, x = fy + i - 1, fx + j - 1
                     phase = (y % divisions) * divisions + x % divisions
-                    start[j] = phase * per_phase + (y // divisions) * n_columns + x // divisions
-                product = weights[0, i] * weights[1]
-                at = 0
-                for k in range(len(rows)):
-                    _add_4(nodes, at, rows[k, 2], flat, start, rows[k, 0] * n_columns + rows[k, 1], product)
-                    at += rows[k, 2]
-        for s in range(len(indptr) - 1):
-            total = 0.0
-            for e in range(indptr[s], indptr[s + 1]):
-                total += data[e] * nodes[indices[e]]
-            out[p, s] = total
-
-
-@numba.njit(cache=True, nogil=True)
-def _cubic(t: float, weights: Array) -> None:
-    """Lagrange's, for values at -1, 0, 1 and 2."""
-    weights[0] = -t * (t - 1) * (t - 2) / 6
-    weights[1] = (t + 1) * (t - 1) * (t - 2) / 2
-    weights[2] = -(t + 1) * t * (t - 2) / 2
-    weights[3] = (t + 1) * t * (t - 1) / 6
-
-
-# Unsigned indices cannot count from the end, and a known number of columns leaves no rest: so these loops vectorise.
-
-
-@numba.njit(cache=True, nogil=True)
-def _add(out: Array, first: int, n: int, table: Array, start: int) -> None:
-    f, s = np.uintp(first), np.uintp(start)
-    for block in range(np.uintp(n) // np.uintp(_COLUMNS)):
-        for k in range(_COLUMNS):
-            q = block * np.uintp(_COLUMNS) + np.uintp(k)
-            out[f + q] += table[s + q]
+                    starts[p, tap] = phase * per_phase + (y // divisions) * n_columns + x // divisions
+                    weights[p, tap] = wy[i] * lx[j] + ly[i] * wx[j] - ly[i] * lx[j]
+                    tap += 1
+    return starts, weights
 
 
 @numba.njit(cache=True, nogil=True, fastmath={"contract"})
-def _add_4(out: Array, first: int, n: int, table: Array, start: Indices, beyond: int, weights: Array) -> None:
-    f, w0, w1, w2, w3 = np.uintp(first), weights[0], weights[1], weights[2], weights[3]
-    s0, s1 = np.uintp(start[0] + beyond), np.uintp(start[1] + beyond)
-    s2, s3 = np.uintp(start[2] + beyond), np.uintp(start[3] + beyond)
-    for block in range(np.uintp(n) // np.uintp(_COLUMNS)):
-        for k in range(_COLUMNS):
-            q = block * np.uintp(_COLUMNS) + np.uintp(k)
-            out[f + q] += w0 * table[s0 + q] + w1 * table[s1 + q] + w2 * table[s2 + q] + w3 * table[s3 + q]
+def _slopes(nodes: Matrix, indptr: Indices, indices: Indices, data: Matrix, out: Matrix) -> None:
+    # the gradient is read once for four points
+    for p in range(0, len(nodes), 4):
+        last = len(nodes) - 1
+        p1, p2, p3 = min(p + 1, last), min(p + 2, last), min(p + 3, last)
+        n0, n1, n2, n3 = nodes[p], nodes[p1], nodes[p2], nodes[p3]
+        for s in range(len(indptr) - 1):
+            s0 = s1 = s2 = s3 = data.dtype.type(0)
+            for e in range(indptr[s], indptr[s + 1]):
+                i, d = indices[e], data[e]
+                s0 += d * n0[i]
+                s1 += d * n1[i]
+                s2 += d * n2[i]
+                s3 += d * n3[i]
+            out[p, s], out[p1, s], out[p2, s], out[p3, s] = s0, s1, s2, s3
+
+
+@numba.njit(cache=True, nogil=True)
+def _cubic(t: float, cubic: Array, linear: Array) -> None:
+    """Lagrange's, for values at -1, 0, 1 and 2, and linear interpolation from the middle two."""
+    cubic[0] = -t * (t - 1) * (t - 2) / 6
+    cubic[1] = (t + 1) * (t - 1) * (t - 2) / 2
+    cubic[2] = -(t + 1) * t * (t - 2) / 2
+    cubic[3] = (t + 1) * t * (t - 1) / 6
+    linear[1], linear[2] = 1 - t, t

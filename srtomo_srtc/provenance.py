@@ -40,7 +40,7 @@ class Stages:
     def within(self, done: float, first: float, last: float) -> None:
         """A share ``done`` of the stage is behind, whose own shares of the whole are ``first`` to ``last``."""
         if self._progress is not None:
-            self._progress(self._name, first + (last - first) * done)
+            self._progress(self._name, (1 - done) * first + done * last)
 
 
 def provenance(system: System, method: str, gain: float, seconds: dict[str, float], **details: Any) -> dict[str, Any]:
@@ -75,6 +75,7 @@ def provenance(system: System, method: str, gain: float, seconds: dict[str, floa
                         "read_noise",
                         "pixels",
                         "pixel_scale",
+                        "field_stop",
                         "noise_covariance",
                     },
                 )

@@ -41,9 +41,12 @@ class SymmetricTiles:
         self.starts = [n * i // across for i in range(across + 1)]
         sizes = [b - a for a, b in pairwise(self.starts)]
         self.dtype = np.dtype(dtype)
-        self.tiles: list[list[Matrix]] = [
-            [np.zeros((size, sizes[j]), self.dtype) for j in range(i + 1)] for i, size in enumerate(sizes)
-        ]
+        # one piece of memory, which goes back to the system as a whole; the heap would keep that of single tiles
+        memory = np.zeros(sum(size * end for size, end in zip(sizes, self.starts[1:], strict=True)), self.dtype)
+        self.tiles: list[list[Matrix]] = []
+        for i, size in enumerate(sizes):
+            *row, memory = np.split(memory, [size * end for end in self.starts[1 : i + 2]])
+            self.tiles.append([tile.reshape(size, -1) for tile in row])
 
     @classmethod
     def of(cls, S: Matrix) -> SymmetricTiles:
@@ -131,7 +134,7 @@ class SymmetricTiles:
             upper, failed = potrf(row[k].T, lower=0, overwrite_a=1, clean=1)
             if failed:
                 raise np.linalg.LinAlgError(f"not positive definite: row {self.starts[k] + failed - 1}")
-            row[k] = np.ascontiguousarray(trtri(upper, lower=0, overwrite_c=1)[0].T)
+            row[k][:] = trtri(upper, lower=0, overwrite_c=1)[0].T
 
             below = range(k + 1, across)
             run([partial(self._scale, i, k) for i in below], threads)
@@ -159,7 +162,7 @@ class SymmetricTiles:
         run([partial(solve, slice(*rows)) for rows in pairwise(bounds)], threads, progress)
 
     def _scale(self, i: int, k: int) -> None:
-        self.tiles[i][k] = self.tiles[i][k] @ self.tiles[k][k].T
+        self.tiles[i][k][:] = self.tiles[i][k] @ self.tiles[k][k].T
 
     def _subtract(self, i: int, j: int, k: int) -> None:
         self.tiles[i][j] -= self.tiles[i][k] @ self.tiles[j][k].T

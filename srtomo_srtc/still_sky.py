@@ -96,7 +96,7 @@ class _Sky:
             profile, [*(s.nodes for s in sensors), *(points for _, points in self.fit.footprints(profile.heights))]
         )
         right, tilts = right_hand_side_and_tilts(
-            self.fit, turbulence, sensors, profile.heights, single=True, threads=threads
+            self.fit, turbulence, sensors, profile.heights, fast=True, threads=threads
         )
         self.S = slope_tiles(turbulence, sensors, fast=True, threads=threads)
         self.S.add(noise_covariance(system, layout, system.loop.gain))

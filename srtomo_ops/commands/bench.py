@@ -71,7 +71,7 @@ def _reconstruct(options: argparse.Namespace) -> int:
     )
     for stage, seconds in build.stages.items():
         print(f"  {stage:<28} {seconds:9.2f} s")
-    print(f"  {'all':<28} {build.seconds:9.2f} s")
+    print(f"  {'all':<28} {build.seconds:9.2f} s, {build.cpu_seconds:.2f} s of CPU time")
     print(f"  {'peak memory':<28} {build.peak_bytes / _GIB:9.2f} GiB")
     print(f"  {'solution':<28} {build.solving_rate / 1e9:9.1f} GFLOP/s, {fraction:.0%} of a matrix product's")
     write_json(
@@ -83,6 +83,7 @@ def _reconstruct(options: argparse.Namespace) -> int:
             "threads": options.threads,
             "precision": precision,
             "seconds": build.seconds,
+            "cpu_seconds": build.cpu_seconds,
             "stage_seconds": build.stages,
             "peak_bytes": build.peak_bytes,
             "solving_gflops": build.solving_rate / 1e9,

@@ -21,10 +21,12 @@ from numpy.typing import NDArray
 from srtomo_core.layout import Layout
 from srtomo_core.reconstructor import Reconstructor
 from srtomo_core.system import System
+from srtomo_srtc.memory import require
 from srtomo_srtc.mirrors import interaction_matrix
 from srtomo_srtc.model import blind_modes, layout_of, project
 from srtomo_srtc.provenance import Stages, reconstructor_of
 from srtomo_srtc.reconstructors.implicit import implicit
+from srtomo_srtc.reconstructors.least_squares import bytes_needed
 from srtomo_srtc.split import Split
 
 Array = NDArray[np.float64]
@@ -68,6 +70,7 @@ def glao(
 
     Raises:
         ValueError: the layout has other slopes or commands than the system, or a dark sub-aperture.
+        MemoryError: one line, before any work, if there is not enough.
     """
     if averaging == "numerical":
         wide = over_field(system, field, directions)
@@ -76,6 +79,7 @@ def glao(
         return replace(made, provenance={**made.provenance, **details}), G
 
     layout = layout_of(system, layout)
+    require(bytes_needed(layout), f"ground-layer reconstructor of {system.name}")
     gain = system.loop.gain if noise_gain is None else noise_gain
     stages = Stages(progress)
     stages.enter("interaction matrix", 0.0)

@@ -98,13 +98,23 @@ def implicit(
     G = interaction_matrix(system, layout, threads)
 
     stages.enter("wavefront-slope covariance", 0.15)
-    wanted = right_hand_side(fit, turbulence, later, profile.heights, fast=fast, threads=threads)
+    wanted = right_hand_side(
+        fit,
+        turbulence,
+        later,
+        profile.heights,
+        fast=fast,
+        threads=threads,
+        progress=lambda done: stages.within(done, 0.15, 0.45),
+    )
 
-    stages.enter("slope covariance", 0.5)
-    S = slope_tiles(turbulence, sensors, fast=fast, threads=threads)
+    stages.enter("slope covariance", 0.45)
+    S = slope_tiles(
+        turbulence, sensors, fast=fast, threads=threads, progress=lambda done: stages.within(done, 0.45, 0.55)
+    )
     S.add(noise)
 
-    stages.enter("solution", 0.6)
+    stages.enter("solution", 0.55)
     if split:
         R = commands_from(
             S.dense().astype(np.float64),
@@ -115,9 +125,9 @@ def implicit(
             noise,
         )
     else:
-        divide(wanted, S, blind, threads, lambda done: stages.within(done, 0.6, 1.0))
+        divide(wanted, S, blind, threads, lambda done: stages.within(done, 0.55, 1.0))
         del S
-        R = fit.solve(wanted)
+        R = fit.solve(wanted, threads)
 
     stages.enter("done", 1.0)
     reconstructor = Reconstructor.from_matrices(
@@ -127,6 +137,7 @@ def implicit(
         gain=system.loop.gain,
         command_limit=nominal.stroke,
         label=label,
+        threads=threads,
         provenance=provenance(
             system,
             "predictive" if lag else "implicit",

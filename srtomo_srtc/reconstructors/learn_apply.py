@@ -22,6 +22,7 @@ from srtomo_core.system import System
 from srtomo_srtc.atmosphere import Profile
 from srtomo_srtc.covariance import Sightline, Turbulence, slope_covariance, wavefront_covariance
 from srtomo_srtc.estimator import commands_from
+from srtomo_srtc.memory import require
 from srtomo_srtc.mirrors import interaction_matrix
 from srtomo_srtc.model import blind_modes, layout_of, noise_covariance, sightlines
 from srtomo_srtc.provenance import Stages, reconstructor_of
@@ -76,6 +77,7 @@ def learn_apply(
     Raises:
         ValueError: the layout has other slopes or commands than the system; a matrix is of another shape than stated;
             the virtual sensors belong to other mirrors; a dark sub-aperture; or nothing to split.
+        MemoryError: one line, before any work, if there is not enough.
     """
     layout = layout_of(system, layout)
     gain = system.loop.gain if noise_gain is None else noise_gain
@@ -90,6 +92,10 @@ def learn_apply(
     _expect("slopes", slopes, (n_slopes, n_slopes))
     _expect("truth", truth, (n_virtual, n_slopes))
     _expect("control_matrix", control_matrix, (layout.n_commands, n_virtual))
+    require(
+        8.0 * (4 * n_slopes**2 + 2 * n_slopes * n_virtual + layout.n_commands * (4 * n_slopes + 3 * n_virtual)),
+        f"Learn & Apply reconstructor of {system.name}",
+    )
     profile = Profile.of(system)
     sensors = sightlines(system, layout, profile)
     seen = sensors_carried(sightlines(virtual, virtual_layout, profile), winds(system), -lag)

@@ -19,6 +19,7 @@ from scipy.linalg import cho_factor, cho_solve
 from srtomo_core.layout import Layout
 from srtomo_core.reconstructor import Reconstructor
 from srtomo_core.system import System
+from srtomo_srtc.memory import require
 from srtomo_srtc.mirrors import interaction_matrix
 from srtomo_srtc.model import blind_modes, layout_of, noise_whitening
 from srtomo_srtc.provenance import Stages, reconstructor_of
@@ -53,8 +54,10 @@ def least_squares(
 
     Raises:
         ValueError: the layout has other slopes or commands than the system, or a dark sub-aperture.
+        MemoryError: one line, before any work, if there is not enough.
     """
     layout = layout_of(system, layout)
+    require(bytes_needed(layout), f"least-squares reconstructor of {system.name}")
     gain = system.loop.gain if noise_gain is None else noise_gain
     stages = Stages(progress)
 
@@ -65,6 +68,11 @@ def least_squares(
     whitening = noise_whitening(system, layout, gain)
     R = weighted_inverse(G, whitening.T @ whitening, blind_modes(system, layout), kappa)
     return reconstructor_of(system, R, G, method="least_squares", label=label, gain=gain, stages=stages, kappa=kappa)
+
+
+def bytes_needed(layout: Layout) -> float:
+    """Memory of an inverse of the interaction matrix at its peak, about."""
+    return 8.0 * layout.n_commands * (5 * layout.n_slopes + 3 * layout.n_commands)
 
 
 def weighted_inverse(D: Array, weight: sparse.sparray, blind: Array, kappa: float) -> Array:

@@ -28,6 +28,7 @@ from srtomo_srtc.covariance import Sightline
 from srtomo_srtc.estimator import commands_from
 from srtomo_srtc.fitting import KAPPA, Fit, View
 from srtomo_srtc.geometry import Footprints
+from srtomo_srtc.memory import require
 from srtomo_srtc.mirrors import influence, interaction_matrix
 from srtomo_srtc.model import blind_modes, layout_of, noise_covariance, sightlines
 from srtomo_srtc.provenance import Stages, reconstructor_of
@@ -90,6 +91,7 @@ def modal(
     Raises:
         ValueError: ``pitch_factor`` or ``kept`` out of range; the layout has other slopes or commands than the system,
             or a dark sub-aperture; or there is nothing to split.
+        MemoryError: one line, before most of the work, if there is not enough.
     """
     if not pitch_factor > 0:
         raise ValueError(f"pitch_factor: expected above 0, got {pitch_factor:g}")
@@ -105,6 +107,12 @@ def modal(
     fit = Fit(system, layout, kappa)
     targets = list(fit.footprints(profile.heights))
     mirrors = _virtual_mirrors(layout, profile, [*(s.nodes for s in sensors), *(p for _, p in targets)], pitch_factor)
+    n_modes, n_nodes = max(m.n_actuators for m in mirrors), max(s.nodes.x.shape[1] for s in sensors)
+    require(
+        8.0 * (3 * layout.n_slopes**2 + 4 * layout.n_slopes * layout.n_commands)
+        + 8.0 * n_modes * (4 * n_modes + 2 * max(n_nodes, len(fit.grid.x)) + 2 * layout.n_slopes),
+        f"modal reconstructor of {system.name}",
+    )
 
     stages.enter("interaction matrix", 0.05)
     G = interaction_matrix(system, layout)

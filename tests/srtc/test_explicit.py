@@ -1,6 +1,7 @@
 """The explicit reconstructor: its forms against each other and against the implicit one."""
 
 import json
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -172,7 +173,8 @@ def test_nodes_at_the_rays_own_intercepts_make_the_explicit_reconstructor_the_im
     for l in range(len(profile.heights)):
         x, y = (np.concatenate([getattr(rays, axis)[l] for rays in everyone]) for axis in "xy")
         own = Footprints(x[None], y[None])
-        layers.append(wavefront_covariance(turbulence.only(slice(l, l + 1)), own, own))
+        one = replace(turbulence, fractions=turbulence.fractions[l : l + 1])
+        layers.append(wavefront_covariance(one, own, own))
     layered = covariance_form(wanted, H, layers, sparse.diags_array(noise), blind)
     assert _relative(layered, spatio_angular) < 1e-8
 
