@@ -11,6 +11,7 @@ unexport AMENT_PREFIX_PATH CMAKE_PREFIX_PATH LD_LIBRARY_PATH PYTHONPATH RMW_IMPL
 help:
 	@echo 'make demo [ARGS=...]   run the demo (srtomo demo)'
 	@echo 'make test [ARGS=...]   run the tests; test-slow: the long ones'
+	@echo 'make rival             install pyTomoAO into build/rival, and time the same work against it'
 	@echo 'make lint              ruff and mypy'
 	@echo 'make install           only install into $(VENV), as all of the above do first'
 	@echo 'make clean             remove $(VENV) and what the tools left'
@@ -24,6 +25,12 @@ test: install
 
 test-slow: install
 	$(BIN)/python -m pytest -m slow $(ARGS)
+
+rival: install
+	[ -x build/rival/bin/pip ] || $(PYTHON) -m venv build/rival
+	build/rival/bin/pip install -q pyTomoAO==2.0.0
+	OPENBLAS_NUM_THREADS=1 SRTOMO_RIVAL_PYTHON=$(CURDIR)/build/rival/bin/python \
+		$(BIN)/python -m pytest -m slow -s tests/ops/test_rival_pytomoao.py $(ARGS)
 
 lint: install
 	$(BIN)/ruff check .
@@ -58,4 +65,4 @@ $(STAMP): pyproject.toml $(shell find msgs_schema) $(if $(filter-out $(PYTHON),$
 	@echo ' done'; echo '$(PYTHON)' >$@
 
 FORCE:
-.PHONY: help demo test test-slow lint clean missing install FORCE
+.PHONY: help demo test test-slow rival lint clean missing install FORCE

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import inspect
+import json
 import textwrap
 import time
 from collections.abc import Sequence
@@ -13,6 +14,7 @@ from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from srtomo_ops.options import add_json, add_system, assignments, system_of, writable_file, write_json
 from srtomo_ops.progress import Progress
+from srtomo_srtc.measured import read_measured
 from srtomo_srtc.model import ground_prior
 from srtomo_srtc.reconstructors import METHODS
 
@@ -71,7 +73,13 @@ EXAMPLE = f"""methods, and what --with can set of each, with defaults (SI units;
 examples:
   srtomo reconstruct gnao_ltao_sr -o sr.npz
   srtomo reconstruct gnao_ltao_sr --method explicit --with prior=laplacian --with solver=cg -o sparse.npz
-  srtomo reconstruct mini --prior ground --with kappa=1e-3 -o mini.npz"""
+  srtomo reconstruct mini --method predictive --with epochs=3 --with wind_uncertainty=2 -o mini.npz
+  srtomo reconstruct mini --prior ground --with kappa=1e-3 -o mini.npz
+  srtomo reconstruct mini --method learn_apply --measured covariances.npz -o mini.npz
+
+covariances for --measured: an .npz with 'slopes' (all slopes with each other, noise included, rad^2; radians of tilt,
+sensor by sensor, all x then all y) and, of a truth sensor, 'truth' (its slopes on each science target with all others)
+and 'truth_subapertures' (across the pupil); with the system's 'fingerprint' in it, another system's is refused."""
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -87,30 +95,57 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--method", choices=sorted(METHODS), default="implicit", help="how (default: implicit); all are listed below"
     )
+    add_keywords(parser)
+    parser.add_argument(
+        "--measured",
+        metavar="FILE",
+        type=Path,
+        help="measured covariances for learn_apply to use as they are; the .npz is described below",
+    )
+    parser.add_argument("--label", default="", help="a name for people (default: the prior)")
+    add_json(parser)
+
+
+def add_keywords(parser: argparse.ArgumentParser, where: str = "all are listed below") -> None:
+    """``--with``: see :func:`keywords_of`."""
     parser.add_argument(
         "--with",
         dest="keywords",
         metavar="KEY=VALUE",
         action="append",
         default=[],
-        help="a parameter of the method; all are listed below",
+        help=f"a parameter of the method; {where}",
     )
-    parser.add_argument("--label", default="", help="a name for people (default: the prior)")
-    add_json(parser)
 
 
 def keywords_of(options: argparse.Namespace) -> dict[str, Any]:
     """The method's own parameters from ``--with``.
 
     Raises:
-        ValueError: the method has no such parameter.
+        ValueError: the method has no such parameter, or not of that type.
     """
     own = own_keywords(options.method)
     keywords = assignments(options.keywords, "--with")
-    for key in keywords:
+    hints = get_type_hints(METHODS[options.method])
+    for key, value in keywords.items():
         if key not in own:
             raise ValueError(f"--with {key}: method {options.method} takes {', '.join(own)}")
+        if not _fits(value, hints[key]):
+            raise ValueError(f"--with {key}: expected a value such as in {own[key]}, got {json.dumps(value)}")
     return keywords
+
+
+def _fits(value: Any, hint: Any) -> bool:
+    """Whether a value read from JSON is one of a type that can be typed."""
+    if get_origin(hint) in (Union, UnionType):
+        return any(_fits(value, part) for part in get_args(hint))
+    if get_origin(hint) is Literal:
+        return value in get_args(hint)
+    if hint == Sequence[float]:
+        return isinstance(value, list) and all(_fits(item, float) for item in value)
+    if hint is float:
+        return isinstance(value, int | float) and not isinstance(value, bool)
+    return type(value) is hint
 
 
 def main(options: argparse.Namespace) -> int:
@@ -118,6 +153,10 @@ def main(options: argparse.Namespace) -> int:
     system = system_of(options)
     writable_file(options.output)
     keywords = keywords_of(options)
+    if options.measured is not None:
+        if options.method != "learn_apply":
+            raise ValueError(f"--measured: expected with --method learn_apply, not {options.method}")
+        keywords |= read_measured(str(options.measured), system)
     believed = ground_prior(system) if options.prior == "ground" else system
     start = time.perf_counter()
     with Progress("reconstructor") as progress:
@@ -126,9 +165,10 @@ def main(options: argparse.Namespace) -> int:
         )
     seconds = time.perf_counter() - start
     reconstructor.save(options.output, G)
+    exposures = f" of {reconstructor.n_epochs} exposures" if reconstructor.n_epochs > 1 else ""
     print(
         f"{options.output}: {reconstructor.id:016x}, {reconstructor.n_commands} commands x "
-        f"{reconstructor.n_slopes} slopes, gain {reconstructor.gain:g}, {seconds:.1f} s"
+        f"{reconstructor.n_slopes} slopes{exposures}, gain {reconstructor.gain:g}, {seconds:.1f} s"
     )
     write_json(
         options.json,
@@ -138,6 +178,7 @@ def main(options: argparse.Namespace) -> int:
             "sha256": reconstructor.sha256.hex(),
             "commands": reconstructor.n_commands,
             "slopes": reconstructor.n_slopes,
+            "epochs": reconstructor.n_epochs,
             "seconds": seconds,
             "output": str(options.output),
             "provenance": dict(reconstructor.provenance),

@@ -166,6 +166,7 @@ DOES_NOT_MATTER = {
     "sensors.0.read_noise": 3.0,
     "sensors.0.pixels": 8,
     "sensors.0.pixel_scale": 1e-6,
+    "sensors.0.field_stop": 2e-5,
     "sensors.0.noise_covariance": "noise.npz",
     "mirrors.0.name": "other",
     "mirrors.0.stroke": 5e-6,

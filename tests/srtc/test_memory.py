@@ -1,8 +1,20 @@
 """What does not fit is refused beforehand."""
 
+import importlib
+import tracemalloc
+
 import pytest
 
+from srtomo_core.system import System, load_system
 from srtomo_srtc import memory
+from srtomo_srtc.reconstructors import METHODS
+
+
+@pytest.fixture(scope="module")
+def system() -> System:
+    """Sensors that are only shifted, as ``iterative`` needs them, and enough slopes for matrices to count most."""
+    lasers = {f"sensors.{i}.{key}": value for i in range(3) for key, value in (("rotation", 0.0), ("subapertures", 14))}
+    return load_system("mini", {**lasers, "guide_stars.2.altitude": 90e3, "telescope.obscuration": 0.1})
 
 
 def test_room_for_little_and_not_for_everything() -> None:
@@ -13,3 +25,25 @@ def test_room_for_little_and_not_for_everything() -> None:
 
 def test_available_is_what_the_host_has_or_less() -> None:
     assert 0 < memory.available() < 1e15
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_every_method_refuses_what_does_not_fit(method: str, system: System, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(memory, "available", lambda: 1e3)
+    with pytest.raises(MemoryError, match=r"needs \d\.\d GiB of memory, 0\.0 GiB are available$"):
+        METHODS[method](system)
+
+
+@pytest.mark.parametrize("method", ["learn_apply", "modal"])
+def test_what_it_says_is_what_it_needs(method: str, system: System, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not less, and not much more."""
+    METHODS[method](load_system("mini"))  # compiles
+    stated: list[float] = []
+    module = importlib.import_module(f"srtomo_srtc.reconstructors.{method}")  # the function has the same name
+    monkeypatch.setattr(module, "require", lambda n_bytes, _: stated.append(n_bytes))
+    tracemalloc.start()
+    METHODS[method](system)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    print(method, peak / stated[0])
+    assert 0.5 * stated[0] < peak < 1.15 * stated[0]
