@@ -49,10 +49,10 @@ missing:
 	@$(PYTHON) -c 'import os, sysconfig; os.stat(sysconfig.get_path("include") + "/Python.h")' 2>/dev/null || \
 		echo $(notdir $(PYTHON))-dev
 
-# Editable: the Python sources are used where they are, only the compiled messages have to follow their files.
+# Editable: the Python sources are used where they are, only messages and frame path have to be compiled anew.
 # A new .venv for another PYTHON, or where the last installation was cut off.
 install: $(STAMP)
-$(STAMP): pyproject.toml $(shell find msgs_schema) $(if $(filter-out $(PYTHON),$(shell cat $(STAMP) 2>/dev/null)),FORCE)
+$(STAMP): pyproject.toml $(shell find msgs_schema srtomo_rtc/native) $(if $(filter-out $(PYTHON),$(shell cat $(STAMP) 2>/dev/null)),FORCE)
 	@missing=$$($(MAKE) -s missing | xargs); \
 	[ -z "$$missing" ] || { echo "srtomo: not everything is here that it is built with: apt-get install $$missing"; exit 1; }
 	@$(PYTHON) -c 'import sys; sys.exit(not (3, 10) <= sys.version_info[:2] <= (3, 13))' || \

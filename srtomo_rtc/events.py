@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from srtomo_rtc.hrtc import Change, Snapshot
 from srtomo_rtc.loop import Program, Settings
-from srtomo_rtc.vmm import KERNEL
+from srtomo_rtc.vmm import KERNELS
 
 
 class EventKind(enum.IntEnum):
@@ -55,10 +55,10 @@ def event_fields(
         "first_frame": frame,
         "loop_state": int(closed),
         "delay": delay,
-        "kernel": KERNEL,
     }
     if program is not None:
-        fields |= {"reconstructor": program.slot.id, "sha256": list(program.slot.sha256)}
+        slot = program.slot
+        fields |= {"reconstructor": slot.id, "sha256": list(slot.sha256), "kernel": KERNELS[slot.kernel]}
         settings = program.settings
     if settings is not None:
         names = ("polc", "leak", "relaxation", "command_limit", "fault_budget")

@@ -1,19 +1,34 @@
 """The hot endpoints: raw slopes in, raw commands out, on a node that no executor spins.
 
-An executor would take most of their messages itself. Waiting is behind :class:`HotEndpoints.wait` alone, so that
-another way of waiting (polling, or out of the interpreter) changes nothing else.
+An executor would take most of their messages itself. The loop's thread waits, takes and publishes in ``native/ros.c``,
+where the interpreter cannot hold it up, or, where that cannot be loaded or is not wanted, here; the bytes are the same.
 """
 
 from __future__ import annotations
 
+import ctypes
+import os
+import time
 from types import TracebackType
+from typing import Any
 
+import numpy as np
 from msgs_schema.msg import DmCommand, SlopeFrame
+from numpy.typing import NDArray
+from rclpy.duration import Duration
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
 from srtomo_core import wire
+from srtomo_rtc import native
+from srtomo_rtc.hrtc import Hrtc
+from srtomo_rtc.realtime import Outcome
+
+_TIMEOUT = 100_000_000  # ns between looks at what was posted when nothing comes
+_POLL = 20_000_000  # ns without a message after which polling gives way to blocking
+_LAST_WORD = Duration(nanoseconds=200_000_000)  # for readers of the last command
+_CORES_TO_POLL = 4  # the middleware's threads, the executor's and the system's have to find another core
 
 
 class HotEndpoints:
@@ -23,9 +38,32 @@ class HotEndpoints:
     Args:
         node: plain node, not in any executor.
         command_depth: depth of the command's writer, messages.
+        compiled: run out of the interpreter, if that can be.
+        waiting: ``blocking``, ``polling`` while slopes come, or ``auto``: by the number of cores.
+
+    Attributes:
+        outcome: how the loop's thread waits, takes and publishes, and why so.
+        received: (n, 2) for measurements: frame and time (ns, the system's clock) at which the middleware received each
+            of the first n messages that fit; n is ``room``. Only out of the interpreter.
     """
 
-    def __init__(self, node: Node, command_depth: int) -> None:
+    room = 0
+
+    def __init__(self, node: Node, command_depth: int, compiled: bool = True, waiting: str = "auto") -> None:
+        cores = len(os.sched_getaffinity(0))
+        polling = waiting == "polling" or (waiting == "auto" and cores >= _CORES_TO_POLL)
+        self._library: Any = None
+        self._ros = native.Ros(poll_ns=_POLL if polling else 0)
+        how = f"{'polling' if polling else 'blocking'} ({waiting}, {cores} cores)"
+        if not compiled:
+            self.outcome = Outcome("frame path", True, "rclpy, blocking (asked for)")
+        else:
+            try:
+                self._library = native.load_ros()
+                self.outcome = Outcome("frame path", True, f"compiled, {how}")
+            except ImportError as error:
+                self.outcome = Outcome("frame path", False, f"compiled; rclpy is used instead ({error})")
+        self._received = np.zeros((self.room, 2), np.int64)
         self._subscription = node.create_subscription(
             SlopeFrame, wire.SLOPES.name, lambda _: None, QoSProfile(**wire.SLOPES.qos()), raw=True
         )
@@ -48,6 +86,47 @@ class HotEndpoints:
         self._guard.handle.__exit__(kind, value, trace)
         self._publisher.handle.__exit__(kind, value, trace)
         self._subscription.handle.__exit__(kind, value, trace)
+
+    def run(self, hrtc: Hrtc) -> None:
+        """Wait, take and answer until ``hrtc.stopping``; then publish flat. The loop's thread.
+
+        Raises:
+            RuntimeError: the middleware failed.
+        """
+        with self:
+            if self._library is None:
+                self._run_here(hrtc)
+            else:
+                self._run_compiled(hrtc)
+            # what is destroyed before its last message was read takes that with it
+            self._publisher.wait_for_all_acked(_LAST_WORD)
+
+    def _run_compiled(self, hrtc: Hrtc) -> None:
+        ros = self._ros
+        context: Any = self._node.context.handle
+        ros.context, ros.wake = context.pointer, self._guard.handle.pointer
+        ros.slopes, ros.commands = self._subscription.handle.pointer, self._publisher.handle.pointer
+        ros.received, ros.received_room = self._received.ctypes.data, len(self._received)
+        if self._library.srt_run(hrtc.gate, ros) != 0:
+            text = ctypes.create_string_buffer(1024)
+            self._library.srt_ros_error(text, len(text))
+            raise RuntimeError(text.value.decode(errors="replace"))
+
+    def _run_here(self, hrtc: Hrtc) -> None:
+        hrtc.start()
+        while not hrtc.stopping:
+            self.wait(_TIMEOUT)
+            while (message := self.take()) is not None:
+                hrtc.offer(message, time.monotonic_ns())
+            hrtc.advance()
+            hrtc.idle(time.monotonic_ns())
+        if hrtc.not_flat:
+            hrtc.flatten()
+
+    @property
+    def received(self) -> NDArray[np.int64]:
+        """See the class. Once the loop's thread has left."""
+        return self._received[: self._ros.received_count]
 
     def wait(self, timeout_ns: int) -> None:
         """Block until slopes came, :meth:`wake` was called, or the time is over. The loop's thread."""

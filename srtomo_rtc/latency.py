@@ -2,32 +2,46 @@
 
 from __future__ import annotations
 
-import math
+import ctypes
 
 import numpy as np
 
+from srtomo_rtc import native
+
 _PER_OCTAVE = 16
 _FIRST = 1000  # ns; everything faster shares the first bin
-_OCTAVES = 24  # up to 17 s
 
 
 class LatencyHistogram:
-    """Counts in bins of 1/16 octave from 1 us: quantiles to 4.4 %. One thread adds; any thread may read."""
+    """Counts in bins of 1/16 octave from 1 us to 17 s: quantiles to 4.4 %. One thread adds; any thread may read.
 
-    def __init__(self, deadline_ns: int) -> None:
-        self.counts = np.zeros(_PER_OCTAVE * _OCTAVES, np.int64)
-        self.deadline_ns = deadline_ns
-        self.misses = 0
-        self.max_ns = 0
+    Args:
+        deadline_ns: latency above which one counts as a miss.
+        shared: the frame path's own; the deadline is in it.
+    """
+
+    def __init__(self, deadline_ns: int = 0, shared: native.Latency | None = None) -> None:
+        self._c = native.Latency(deadline_ns=deadline_ns) if shared is None else shared
+        self.counts = np.ctypeslib.as_array(self._c.counts)
 
     def add(self, nanoseconds: int) -> None:
         """Count one latency."""
-        place = int(_PER_OCTAVE * math.log2(nanoseconds / _FIRST)) if nanoseconds > _FIRST else 0
-        self.counts[min(place, len(self.counts) - 1)] += 1
-        if nanoseconds > self.max_ns:
-            self.max_ns = nanoseconds
-        if nanoseconds > self.deadline_ns:
-            self.misses += 1
+        native.lib.srt_latency_add(ctypes.byref(self._c), nanoseconds)
+
+    @property
+    def deadline_ns(self) -> int:
+        """Latency above which one counts as a miss."""
+        return int(self._c.deadline_ns)
+
+    @property
+    def misses(self) -> int:
+        """Latencies above the deadline."""
+        return int(self._c.misses)
+
+    @property
+    def max_ns(self) -> int:
+        """The largest."""
+        return int(self._c.max_ns)
 
     def quantile(self, share: float) -> float:
         """Upper edge of the bin that holds quantile ``share`` (0 to 1), s; 0 before the first count."""

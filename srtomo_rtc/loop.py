@@ -1,4 +1,4 @@
-"""The control law, a frame at a time: no ROS, no allocation, no lock.
+"""The control law, a frame at a time: no ROS, no allocation, no lock. It runs in ``native/law.c``, wrapped here.
 
 Pseudo-open-loop control. The mirror shows ``m = clip(u + o)``; the state is ``u = m - o``, so clipping acts on the
 state and there is no wind-up. With ``m~[k]`` on the mirror during exposure k, ``u~[k] = m~[k] - o`` and ``Q = R G``::
@@ -24,20 +24,23 @@ of :class:`Slot` and :class:`Program`.
 
 from __future__ import annotations
 
+import ctypes
 import enum
+import itertools
 import math
-from collections.abc import Mapping, Sequence
+import weakref
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from srtomo_core.layout import Layout
 from srtomo_core.reconstructor import Reconstructor
-from srtomo_core.wire import MIRROR_UNKNOWN
-from srtomo_rtc.vmm import all_finite, multiply
+from srtomo_rtc import native
+from srtomo_rtc.native import lib
+from srtomo_rtc.vmm import huge_zeros, multiply, quantise, rows_of, tiled, tiles_shape, untiled
 
 Floats = NDArray[np.float32]
 
@@ -46,8 +49,6 @@ HISTORY = 64
 
 MAX_EPOCHS = 8
 """Exposures that a loop can be made for."""
-
-_NEVER = -(2**62)  # no frame has this number, nor the one before the first
 
 
 class Verdict(enum.IntEnum):
@@ -92,56 +93,96 @@ class Settings:
             object.__setattr__(self, name, float(np.float32(getattr(self, name))))
 
 
-class Columns:
-    """R and Q for one exposure, by columns: R sensor by sensor.
+class Matrices:
+    """R and Q for one exposure, in tiles (:func:`srtomo_rtc.vmm.tiled`).
 
     Attributes:
-        R: of each sensor, (n_slopes_w, n_commands).
-        Q: (n_commands, n_commands).
+        R_tiles: of each sensor, its columns sub-aperture by sub-aperture: x, then y; 16-bit integers for kernel int16.
+        R_scales: of each sensor, (n_rows of the tiles,) what its integers are in m/rad; None for kernel float32.
+        Q_tiles: its columns command by command.
     """
 
-    def __init__(self, layout: Layout) -> None:
-        m = layout.n_commands
-        self.R = tuple(np.zeros((s.n_slopes, m), np.float32) for s in layout.sensors)
-        self.Q = np.zeros((m, m), np.float32)
+    def __init__(self, layout: Layout, kernel: str = "float32") -> None:
+        n_rows = rows_of(layout.n_commands)
+        kind: type = np.int16 if kernel == "int16" else np.float32
+        self._n_commands = layout.n_commands
+        self.R_tiles = tuple(huge_zeros(tiles_shape(layout.n_commands, s.n_slopes, kind), kind) for s in layout.sensors)
+        self.R_scales = tuple(np.ones(n_rows, np.float32) for _ in layout.sensors) if kernel == "int16" else None
+        self.Q_tiles = huge_zeros(tiles_shape(layout.n_commands, layout.n_commands, np.float32), np.float32)
 
     def fill(self, R: Floats, Q: Floats) -> None:
-        """Copy R (n_commands, n_slopes) and Q in."""
+        """Copy R (n_commands, n_slopes) and Q in.
+
+        Raises:
+            ValueError: R cannot be held in 16 bits.
+        """
         start = 0
-        for columns in self.R:
-            np.copyto(columns, R[:, start : start + len(columns)].T)
-            start += len(columns)
-        np.copyto(self.Q, Q.T)
+        for w, tiles in enumerate(self.R_tiles):
+            n = tiles.shape[1]
+            own: NDArray[Any] = R[:, start : start + n].reshape(len(R), 2, -1).transpose(0, 2, 1).reshape(len(R), n)
+            if self.R_scales is not None:
+                own, self.R_scales[w][: len(R)] = quantise(own)
+            tiled(own, tiles)
+            start += n
+        tiled(Q, self.Q_tiles)
+
+    @property
+    def R(self) -> Floats:
+        """(n_commands, n_slopes) as it is applied, a copy."""
+        m, own = self._n_commands, []
+        for w, tiles in enumerate(self.R_tiles):
+            matrix = untiled(tiles, m) * (1 if self.R_scales is None else self.R_scales[w][:m, None])
+            own.append(matrix.reshape(m, -1, 2).transpose(0, 2, 1).reshape(m, -1))
+        return np.concatenate(own, axis=1)
+
+    @property
+    def Q(self) -> Floats:
+        """(n_commands, n_commands), a copy."""
+        return untiled(self.Q_tiles, self._n_commands)
 
     def times(self, slopes: Floats) -> Floats:
-        """``R slopes`` (n_commands,), sensor by sensor; a new array."""
-        out, part, start = np.zeros(len(self.Q), np.float32), np.empty(len(self.Q), np.float32), 0
-        for columns in self.R:
-            multiply(columns, slopes[start : start + len(columns)], part)
-            out += part
-            start += len(columns)
+        """``R slopes``, sensor by sensor; a new array with the tiles' rows."""
+        out = np.zeros(rows_of(self._n_commands), np.float32)
+        part = np.empty_like(out)
+        start = 0
+        for w, tiles in enumerate(self.R_tiles):
+            own = slopes[start : start + tiles.shape[1]]
+            multiply(tiles, np.ascontiguousarray(own.reshape(2, -1).T).ravel(), part)
+            out += part if self.R_scales is None else part * self.R_scales[w]
+            start += len(own)
         return out
 
     def warm(self) -> None:
         """Touch every byte."""
-        self.times(np.zeros(sum(map(len, self.R)), np.float32))
-        multiply(self.Q, np.zeros(len(self.Q), np.float32), np.empty(len(self.Q), np.float32))
+        self.times(np.zeros(sum(tiles.shape[1] for tiles in self.R_tiles), np.float32))
+        multiply(self.Q_tiles, np.zeros(self._n_commands, np.float32), np.empty(rows_of(self._n_commands), np.float32))
+
+    def native(self) -> native.Matrices:
+        """For the frame path; valid as long as this object."""
+        made = native.Matrices(Q=self.Q_tiles.ctypes.data)
+        for w, tiles in enumerate(self.R_tiles):
+            made.R[w] = tiles.ctypes.data
+            if self.R_scales is not None:
+                made.R_scales[w] = self.R_scales[w].ctypes.data
+        return made
 
 
 class Slot:
     """Memory for one reconstructor. Made once, filled off the loop.
 
     Attributes:
+        kernel: float32 or int16.
         n_epochs: of the reconstructor in it.
         epochs: matrices of each epoch that there is room for, the newest exposure first.
         fallback: for the newest exposure alone; the first epoch's where there is room for no more.
     """
 
-    def __init__(self, layout: Layout, max_epochs: int = 1) -> None:
+    def __init__(self, layout: Layout, max_epochs: int = 1, kernel: str = "float32") -> None:
         m = layout.n_commands
+        self.kernel = kernel
         self.n_epochs = 1
-        self.epochs = tuple(Columns(layout) for _ in range(max_epochs))
-        self.fallback = Columns(layout) if max_epochs > 1 else self.epochs[0]
+        self.epochs = tuple(Matrices(layout, kernel) for _ in range(max_epochs))
+        self.fallback = Matrices(layout, kernel) if max_epochs > 1 else self.epochs[0]
         self.slope_reference = np.zeros(layout.n_slopes, np.float32)
         self.command_limit = np.zeros(m, np.float32)
         self.gain = 0.0
@@ -152,13 +193,13 @@ class Slot:
         """Copy a checked reconstructor in. Not on the loop's thread, and never into a slot in use.
 
         Raises:
-            ValueError: it has more epochs than there is room for.
+            ValueError: it has more epochs than there is room for, or cannot be held in 16 bits.
         """
         if reconstructor.n_epochs > len(self.epochs):
             raise ValueError(f"uses {reconstructor.n_epochs} exposures; there is room for {len(self.epochs)}")
         self.n_epochs = reconstructor.n_epochs
-        for columns, (R, Q) in zip((*self.epochs[: self.n_epochs], self.fallback), reconstructor.parts, strict=False):
-            columns.fill(R, Q)
+        for matrices, (R, Q) in zip((*self.epochs[: self.n_epochs], self.fallback), reconstructor.parts, strict=False):
+            matrices.fill(R, Q)
         self.slope_reference[:] = reconstructor.slope_reference
         self.command_limit[:] = reconstructor.command_limit
         self.gain = reconstructor.gain
@@ -166,94 +207,98 @@ class Slot:
         self.id = reconstructor.id
 
 
+_tokens = itertools.count(1)
+
+
+def _padded(values: Floats, n_rows: int) -> Floats:
+    """With zeros for the tiles' rows that no command has."""
+    return np.concatenate([values, np.zeros(n_rows - len(values), np.float32)]).astype(np.float32)
+
+
 class Program:
     """A slot under settings, ready to run: the one object that the loop reads once a frame.
 
     Immutable; made off the loop, so that nothing is computed or allocated when it is taken up.
+
+    Attributes:
+        token: names it in the frame path.
+        native: the frame path's; the slot's memory and this object's.
     """
 
     def __init__(self, slot: Slot, settings: Settings) -> None:
         self.slot = slot
         self.settings = settings
-        self.gain = np.float32(slot.gain)
+        self.token = next(_tokens)
+        several = slot.n_epochs > 1
+        alone = slot.fallback if several else slot.epochs[0]
+        epochs = slot.epochs[: slot.n_epochs]
+        slope_reference = settings.slope_reference + slot.slope_reference
+        alone_reference = alone.times(slope_reference)
+        n_rows = len(alone_reference)
+        reference = np.zeros_like(alone_reference)
+        for part in epochs:
+            reference += part.times(slope_reference)
+        limit = np.minimum(slot.command_limit, np.float32(settings.command_limit))
         keep = 1.0 - settings.leak
-        self.keep = np.float32(keep * (1.0 - slot.gain) if settings.polc else keep)
-        self.relaxation = np.float32(settings.relaxation)
-        self.limit = np.minimum(slot.command_limit, np.float32(settings.command_limit))
-        reference = settings.slope_reference + slot.slope_reference
-        self.several = slot.n_epochs > 1
-        self.alone = slot.fallback if self.several else slot.epochs[0]
-        self.alone_reference = self.alone.times(reference)
-        self.reference = np.zeros_like(self.alone_reference)
-        for columns in slot.epochs[: slot.n_epochs]:
-            self.reference += columns.times(reference)
+        self._matrices = {alone, *epochs}
+        self._held = (
+            _padded(settings.offset, n_rows),
+            _padded(limit, n_rows),
+            reference,
+            alone_reference,
+            (native.Matrices * len(epochs))(*(part.native() for part in epochs)),
+            alone.native(),
+        )
+        offset, limits, all_epochs, one, *matrices = self._held
+        self.native = native.Program(
+            self.token,
+            slot.id,
+            settings.id,
+            settings.fault_budget,
+            len(epochs),
+            settings.polc,
+            slot.gain,
+            keep * (1.0 - slot.gain) if settings.polc else keep,
+            settings.relaxation,
+            *(vector.ctypes.data for vector in (offset, limits, all_epochs, one)),
+            matrices[0],
+            ctypes.pointer(matrices[1]),
+        )
 
     def warm(self) -> None:
         """Touch every byte that a frame reads: the first product with a cold matrix takes 2-3 times as long."""
-        for columns in {*self.slot.epochs[: self.slot.n_epochs], self.alone}:
-            columns.warm()
+        for matrices in self._matrices:
+            matrices.warm()
 
 
-_JIT: dict[str, Any] = {"nogil": True, "cache": True, "fastmath": False}
+_REMEMBERED = 264  # programs that a change or snapshot which nobody has taken yet may name
 
 
-@numba.njit("void(f4[::1], f4[::1], f4, f4[::1], f4[::1])", **_JIT)
-def _state_on_mirror(newest: Floats, before: Floats, fraction: float, offset: Floats, out: Floats) -> None:
-    rest = np.float32(1.0) - fraction
-    for i in range(len(out)):
-        out[i] = (fraction * newest[i] + rest * before[i]) - offset[i]
+class Owner:
+    """What the library allocated, given back when nothing here uses it any more."""
+
+    def __init__(self, pointer: Any, free: Callable[[Any], None], what: str) -> None:
+        if not pointer:
+            raise MemoryError(what)
+        self.pointer = pointer
+        weakref.finalize(self, free, pointer).atexit = False
 
 
-@numba.njit("void(f4[::1], f4[::1])", **_JIT)
-def _add(part: Floats, out: Floats) -> None:
-    for i in range(len(out)):
-        out[i] += part[i]
+def check_size(layout: Layout, delay: float, max_epochs: int) -> tuple[Any, int, int, float, int]:
+    """What the library makes a loop from.
 
-
-@numba.njit("void(f4[::1], f4[::1], f4[::1], f4, f4, f4[::1])", **_JIT)
-def _prepared(state: Floats, q: Floats, reference: Floats, keep: float, gain: float, out: Floats) -> None:
-    for i in range(len(out)):
-        out[i] = keep * state[i] + gain * (q[i] - reference[i])
-
-
-@numba.njit("b1(f4[::1], f4, f4[:,::1], f4[::1])", **_JIT)
-def _next_state(prepared: Floats, gain: float, parts: Floats, out: Floats) -> bool:
-    finite = True
-    for i in range(len(out)):
-        total = parts[0, i]
-        for w in range(1, len(parts)):
-            total += parts[w, i]
-        out[i] = prepared[i] + gain * total
-        if not np.isfinite(out[i]):
-            finite = False
-    return finite
-
-
-@numba.njit("i8(f4[::1], f4[::1], f4[::1], f4[::1])", **_JIT)
-def _clip(state: Floats, offset: Floats, limit: Floats, command: Floats) -> int:
-    """m = clip(u + o), u = m - o where that changed anything; how many were clipped."""
-    clipped = 0
-    for i in range(len(state)):
-        m = state[i] + offset[i]
-        if m > limit[i]:
-            m = limit[i]
-            state[i] = m - offset[i]
-            clipped += 1
-        elif m < -limit[i]:
-            m = -limit[i]
-            state[i] = m - offset[i]
-            clipped += 1
-        command[i] = m
-    return clipped
-
-
-@numba.njit("void(f4[::1], f4)", **_JIT)
-def _relax(state: Floats, relaxation: float) -> None:
-    keep = np.float32(1.0) - relaxation
-    for i in range(len(state)):
-        state[i] *= keep
-        if abs(state[i]) < 1e-12:  # a picometre: do not decay into denormals
-            state[i] = 0.0
+    Raises:
+        ValueError: the frame path is not made for that.
+    """
+    if not 1 <= delay < HISTORY - 1 - MAX_EPOCHS:
+        raise ValueError(f"delay: expected 1 to {HISTORY - 2 - MAX_EPOCHS} frames, got {delay}")
+    if not 1 <= max_epochs <= MAX_EPOCHS:
+        raise ValueError(f"epochs: expected 1 to {MAX_EPOCHS}, got {max_epochs}")
+    n = len(layout.sensors)
+    if n > native.MAX_SENSORS:
+        raise ValueError(f"sensors: expected at most {native.MAX_SENSORS}, got {n}")
+    counts = (ctypes.c_uint32 * n)(*(sensor.n_valid for sensor in layout.sensors))
+    return counts, n, layout.n_commands, delay, max_epochs
 
 
 class Loop:
@@ -263,83 +308,135 @@ class Loop:
     other public attributes describe the answer, and once it is out, :meth:`prepare` gets ready for the next.
 
     Attributes:
-        frame: the next frame to answer; sensors: bit w set once sensor w was added to it.
-        answered, used: the last frame answered, and the sensors that had come by then.
         command: (n_commands,) the last answer m, m of wavefront.
         state: (n_commands,) u after it.
-        closed: whether the loop is closed for the next frame.
         max_epochs: exposures that a reconstructor may use.
-        program: what the next frame is made with; None before the first one.
-        n_clipped, mirror_frame, mirror_frame_before, mirror_fraction: of the last answer, as in DmCommand.
     """
 
-    def __init__(self, layout: Layout, delay: float, max_epochs: int = 1) -> None:
+    def __init__(self, layout: Layout, delay: float, max_epochs: int = 1, gate: Owner | None = None) -> None:
         """Allocate everything.
 
         Args:
             delay: mid-exposure to mid-command, frames, at least 1.
             max_epochs: exposures that a reconstructor may use, 1 to :data:`MAX_EPOCHS`.
+            gate: the frame gate that this is the loop of; it has made it.
         """
-        if not 1 <= delay < HISTORY - 1 - MAX_EPOCHS:
-            raise ValueError(f"delay: expected 1 to {HISTORY - 2 - MAX_EPOCHS} frames, got {delay}")
-        if not 1 <= max_epochs <= MAX_EPOCHS:
-            raise ValueError(f"max_epochs: expected 1 to {MAX_EPOCHS}, got {max_epochs}")
-        self.max_epochs = max_epochs
+        made = gate
+        if made is None:
+            made = Owner(lib.srt_loop_new(*check_size(layout, delay, max_epochs)), lib.srt_loop_free, "loop")
+        self._owner = made
+        self._pointer = made.pointer if gate is None else made.pointer.contents.loop
+        self._c = c = self._pointer.contents
         self.delay = float(np.float32(delay))  # as it travels in events
-        self._whole = math.floor(self.delay)
-        self._fraction = 1.0 - (self.delay - self._whole)
-        n_sensors, m = len(layout.sensors), layout.n_commands
-        self.n_sensors = n_sensors
-        self.all_sensors = (1 << n_sensors) - 1
-        # by exposure: frame k is in row k % max_epochs
-        self._slopes = np.zeros((max_epochs, layout.n_slopes), np.float32)
-        self._slopes_of = tuple(tuple(row[layout.slopes_of(w)] for w in range(n_sensors)) for row in self._slopes)
-        self._kept = np.full(max_epochs, _NEVER, np.int64)  # the frame, if it was answered OK
-        # what was on the mirror, as in DmCommand
-        self._mirror_frames = np.full((max_epochs, 2), -1, np.int64)
-        self._mirror_fraction = np.ones(max_epochs, np.float32)
-        self._parts = np.zeros((n_sensors, m), np.float32)
-        self._part_of = tuple(self._parts[w] for w in range(n_sensors))
-        self._history = np.zeros((HISTORY, m), np.float32)
-        self._history_of = tuple(self._history[i] for i in range(HISTORY))
-        self._flat = np.zeros(m, np.float32)
-        self._on_mirror = np.zeros(m, np.float32)
-        self._q = np.zeros(m, np.float32)
-        self._product = np.zeros(m, np.float32)
-        self._older = np.zeros(m, np.float32)
-        self._several = False
-        self._prepared = np.zeros(m, np.float32)
-        self._trial = np.zeros(m, np.float32)
-        self.command = np.zeros(m, np.float32)
-        self.state = np.zeros(m, np.float32)
-        self.program: Program | None = None
-        self._posted: Program | None = None
-        self._requested_closed = False
-        self.closed = False
-        self.consecutive_holds = 0
-        self.opened_by_faults = 0
-        self.start(0)
+        self.max_epochs = max_epochs
+        self.n_sensors, self.all_sensors = int(c.n_sensors), int(c.all_sensors)
+        m, n_rows = layout.n_commands, int(c.n_rows)
+        self._counts = tuple(sensor.n_slopes for sensor in layout.sensors)
+        self.command: Floats = native.view(made, c.command, (n_rows,))[:m]
+        self.state: Floats = native.view(made, c.state, (n_rows,))[:m]
+        self._history: Floats = native.view(made, c.history, (HISTORY, n_rows))[:, :m]
+        self._programs: dict[int, Program] = {}
 
-    # -- from any thread --------------------------------------------------------------------------------------------
+    # -- for any thread to look at ----------------------------------------------------------------------------------
+
+    @property
+    def frame(self) -> int:
+        """The next frame to answer."""
+        return int(self._c.frame)
+
+    @property
+    def first_frame(self) -> int:
+        """The session's first frame."""
+        return int(self._c.first_frame)
+
+    @property
+    def answered(self) -> int:
+        """The last frame answered; -1: none."""
+        return int(self._c.answered)
+
+    @property
+    def sensors(self) -> int:
+        """Bit w set once sensor w was added to the next frame."""
+        return int(self._c.sensors)
+
+    @property
+    def used(self) -> int:
+        """The sensors that had come when the last frame was answered."""
+        return int(self._c.used)
+
+    @property
+    def closed(self) -> bool:
+        """Whether the loop is closed for the next frame."""
+        return bool(self._c.closed)
+
+    @property
+    def verdict(self) -> Verdict:
+        """Of the last answer."""
+        return Verdict(self._c.verdict)
+
+    @property
+    def n_clipped(self) -> int:
+        """Of the last answer, as in DmCommand."""
+        return int(self._c.n_clipped)
+
+    @property
+    def mirror_frame(self) -> int:
+        """Of the last answer, as in DmCommand; so are the next two."""
+        return int(self._c.mirror_frame)
+
+    @property
+    def mirror_frame_before(self) -> int:
+        """See ``mirror_frame``."""
+        return int(self._c.mirror_frame_before)
+
+    @property
+    def mirror_fraction(self) -> float:
+        """See ``mirror_frame``."""
+        return float(self._c.mirror_fraction)
+
+    @property
+    def consecutive_holds(self) -> int:
+        """Frames held in a row."""
+        return int(self._c.consecutive_holds)
+
+    @property
+    def opened_by_faults(self) -> int:
+        """How often the loop opened because more frames in a row were held than the budget allows."""
+        return int(self._c.opened_by_faults)
+
+    @property
+    def program(self) -> Program | None:
+        """What the next frame is made with; None before the first one."""
+        return self.program_named(self._c.token)
+
+    def program_named(self, token: int) -> Program | None:
+        """A program that was posted not long ago."""
+        return self._programs.get(token)
+
+    @property
+    def pending(self) -> bool:
+        """Whether something was posted or requested that the next :meth:`prepare` would take up."""
+        return bool(lib.srt_loop_pending(self._pointer))
+
+    # -- from any thread, one at a time -----------------------------------------------------------------------------
 
     def post(self, program: Program) -> None:
-        """Use ``program`` from the next frame that :meth:`prepare` prepares. Any thread: one reference is stored.
+        """Use ``program`` from the next frame that :meth:`prepare` prepares: one pointer is stored.
 
         Raises:
             ValueError: it uses more exposures than the loop remembers.
         """
         if program.slot.n_epochs > self.max_epochs:
             raise ValueError(f"uses {program.slot.n_epochs} exposures; this loop takes {self.max_epochs}")
-        self._posted = program
+        self._programs[program.token] = program
+        lib.srt_loop_post(self._pointer, program.native)
+        for token in list(self._programs)[:-_REMEMBERED]:
+            if token != self._c.token:
+                del self._programs[token]
 
     def request(self, closed: bool) -> None:
-        """Close or open the loop from the next frame that is prepared. Any thread: one flag is stored."""
-        self._requested_closed = closed
-
-    @property
-    def pending(self) -> bool:
-        """Whether something was posted or requested that the next :meth:`prepare` would take up. Any thread."""
-        return self._posted is not None or (self._requested_closed and self.program is not None) != self.closed
+        """Close or open the loop from the next frame that is prepared: one flag is stored."""
+        lib.srt_loop_request(self._pointer, closed)
 
     # -- from the loop's thread -------------------------------------------------------------------------------------
 
@@ -348,20 +445,7 @@ class Loop:
 
         What was posted waits for the next :meth:`prepare`.
         """
-        self.frame = frame
-        self.first_frame = frame
-        self.closed = self._requested_closed = closed
-        self.consecutive_holds = 0
-        self.sensors = 0
-        self.used = 0
-        self.answered = -1
-        self.verdict = Verdict.OPEN
-        self.n_clipped = 0
-        self.state[:] = 0
-        self._history[:] = 0
-        self._kept[:] = _NEVER
-        self._several = False
-        self._expect_in_time()
+        lib.srt_loop_start(self._pointer, frame, closed)
 
     def resume(
         self,
@@ -380,20 +464,16 @@ class Loop:
             exposures: of earlier frames that were answered OK, by frame: the slopes of each sensor, and what was on the
                 mirror, as in DmCommand. Of more than ``max_epochs - 1`` only the newest matter.
         """
-        self.frame = frame + 1
-        self.first_frame = first_frame
-        self.closed = self._requested_closed = closed
-        self.consecutive_holds = consecutive_holds
+        self.start(first_frame, closed)
+        self._c.frame = frame + 1
+        self._c.consecutive_holds = consecutive_holds
         self.state[:] = state
         for row, command in enumerate(history[-HISTORY:], start=frame + 1 - len(history[-HISTORY:])):
             self._history[row % HISTORY] = command
-        self._kept[:] = _NEVER
         for earlier, (slopes, mirror) in (exposures or {}).items():
             if frame - self.max_epochs < earlier <= frame:
-                row = earlier % self.max_epochs
-                for own, values in zip(self._slopes_of[row], slopes, strict=True):
-                    own[:] = values
-                self._keep(row, earlier, *mirror)
+                values = np.concatenate(slopes).astype(np.float32)
+                lib.srt_loop_remember(self._pointer, earlier, values.ctypes.data, *mirror)
         self.prepare()
 
     def prepare(self) -> None:
@@ -401,153 +481,23 @@ class Loop:
 
         Sensors that were added to the frame already have to be added again.
         """
-        self.sensors = 0
-        if self._posted is not None:
-            self.program, self._posted = self._posted, None
-        self.closed = self._requested_closed and self.program is not None
-        self._form_older()
-        self._expect_in_time()
-
-    def _form_older(self) -> None:
-        """Form the part of c that earlier exposures make, if the program uses them and all are here."""
-        program = self.program
-        self._several = program is not None and program.several and self._kept_back(program.slot.n_epochs - 1)
-        if program is None or not self._several:
-            return
-        self._older[:] = 0
-        for j in range(1, program.slot.n_epochs):
-            row = (self.frame - j) % self.max_epochs
-            columns = program.slot.epochs[j]
-            for w in range(self.n_sensors):
-                multiply(columns.R[w], self._slopes_of[row][w], self._product)
-                _add(self._product, self._older)
-            if program.settings.polc:
-                newest, before = self._mirror_frames[row]
-                self._product_with_mirror(columns.Q, newest, before, self._mirror_fraction[row], self._product)
-                _add(self._product, self._older)
-
-    def _kept_back(self, n: int) -> bool:
-        """Whether the ``n`` exposures before this one are kept."""
-        for frame in range(self.frame - n, self.frame):
-            if self._kept[frame % self.max_epochs] != frame:
-                return False
-        return True
-
-    def _keep(self, row: int, frame: int, newest: int, before: int, fraction: float) -> None:
-        self._kept[row] = frame
-        self._mirror_frames[row, 0] = newest
-        self._mirror_frames[row, 1] = before
-        self._mirror_fraction[row] = fraction
-
-    def _product_with_mirror(self, Q: Floats, newest: int, before: int, fraction: float, out: Floats) -> None:
-        """``Q u~`` with ``fraction`` of the exposure under command ``newest`` and the rest under ``before``."""
-        assert self.program is not None
-        _state_on_mirror(
-            self._shown(newest),
-            self._shown(before),
-            np.float32(fraction),
-            self.program.settings.offset,
-            self._on_mirror,
-        )
-        multiply(Q, self._on_mirror, out)
-
-    def _expect_in_time(self) -> None:
-        self._expect(self.frame - self._whole, self.frame - self._whole - 1, self._fraction)
-
-    def _expect(self, newest: int, before: int, fraction: float) -> None:
-        """Form c with ``fraction`` of the exposure under command ``newest`` and the rest under ``before``."""
-        self.mirror_frame = newest
-        self.mirror_frame_before = before
-        self.mirror_fraction = fraction
-        program = self.program
-        if program is None:
-            return
-        columns = program.slot.epochs[0] if self._several else program.alone
-        if program.settings.polc:
-            self._product_with_mirror(columns.Q, newest, before, fraction, self._q)
-        else:
-            self._q[:] = 0
-        reference = program.alone_reference
-        if self._several:
-            _add(self._older, self._q)
-            reference = program.reference
-        _prepared(self.state, self._q, reference, program.keep, program.gain, self._prepared)
-
-    def _shown(self, frame: int) -> Floats:
-        return self._history_of[frame % HISTORY] if frame >= self.first_frame else self._flat
-
-    def _known(self, frame: int) -> bool:
-        # it still has to be known when this exposure is the oldest that is used, however many the loop takes
-        oldest = self.frame - HISTORY + MAX_EPOCHS
-        return frame == -1 or max(self.first_frame, oldest) <= frame < self.frame
+        lib.srt_loop_prepare(self._pointer)
 
     def add(self, sensor: int, slopes: Floats) -> None:
         """Take one sensor's slopes (n_slopes_w,) of the frame and form its product; they are copied."""
-        own = self._slopes_of[self.frame % self.max_epochs][sensor]
-        own[:] = slopes
-        program = self.program
-        if program is not None:
-            columns = program.slot.epochs[0] if self._several else program.alone
-            multiply(columns.R[sensor], own, self._part_of[sensor])
-        self.sensors |= 1 << sensor
+        values = np.ascontiguousarray(slopes, np.float32)
+        if values.shape != (self._counts[sensor],):
+            raise ValueError(f"sensor {sensor}: expected {self._counts[sensor]} slopes, got shape {values.shape}")
+        lib.srt_loop_add(self._pointer, sensor, values.ctypes.data)
 
     def answer(self, mirror_frame: int, mirror_frame_before: int, mirror_fraction: float) -> Verdict:
         """Answer a frame whose sensors were all added; the arguments are SlopeFrame's."""
         assert self.sensors == self.all_sensors
-        if not self.closed:
-            return self._finish(Verdict.OPEN)
-        assert self.program is not None
-        if not all_finite(self._slopes[self.frame % self.max_epochs]):
-            return self.hold(Verdict.HOLD_NONFINITE)
-        if self.program.settings.polc and mirror_frame != MIRROR_UNKNOWN:
-            if not (
-                self._known(mirror_frame)
-                and (mirror_fraction == 1.0 or self._known(mirror_frame_before))
-                and 0.0 <= mirror_fraction <= 1.0
-            ):
-                return self.hold(Verdict.HOLD_HISTORY)
-            if (
-                mirror_frame != self.mirror_frame
-                or np.float32(mirror_fraction) != np.float32(self.mirror_fraction)
-                or (mirror_fraction != 1.0 and mirror_frame_before != self.mirror_frame_before)
-            ):
-                self._expect(mirror_frame, mirror_frame_before, mirror_fraction)
-        if not _next_state(self._prepared, self.program.gain, self._parts, self._trial):
-            return self.hold(Verdict.HOLD_NONFINITE)
-        self.state[:] = self._trial
-        return self._finish(Verdict.OK)
+        return Verdict(lib.srt_loop_answer(self._pointer, mirror_frame, mirror_frame_before, mirror_fraction))
 
     def hold(self, verdict: Verdict) -> Verdict:
         """Answer a frame without using its slopes: the state is kept (an open loop relaxes on)."""
-        return self._finish(verdict)
-
-    def _finish(self, verdict: Verdict) -> Verdict:
-        program = self.program
-        if verdict is Verdict.OK or verdict is Verdict.OPEN:
-            self.consecutive_holds = 0
-        else:
-            self.consecutive_holds += 1
-        if program is not None:
-            if not self.closed:
-                _relax(self.state, program.relaxation)
-            self.n_clipped = _clip(self.state, program.settings.offset, program.limit, self.command)
-            if self.closed and self.consecutive_holds > program.settings.fault_budget:
-                self._requested_closed = False
-                self.opened_by_faults += 1
-        self._history_of[self.frame % HISTORY][:] = self.command
-        self._keep(
-            self.frame % self.max_epochs,
-            self.frame if verdict is Verdict.OK else _NEVER,
-            self.mirror_frame,
-            self.mirror_frame_before,
-            self.mirror_fraction,
-        )
-        self.verdict = verdict
-        self.used = self.sensors
-        self.answered = self.frame
-        self.frame += 1
-        self.sensors = 0
-        return verdict
+        return Verdict(lib.srt_loop_hold(self._pointer, verdict))
 
     def history(self, frames: int) -> Floats:
         """The last commands, (n, n_commands) with n <= ``frames``, oldest first. A copy: not for the hot path."""

@@ -2,7 +2,8 @@
 
 Three threads. The loop's thread waits for slopes, runs :class:`~srtomo_rtc.hrtc.Hrtc` and publishes commands. The
 executor's thread (main) serves lifecycle, parameters, services, status and events. One worker stages reconstructors.
-The executor and the worker never touch the loop's arrays: they post references and read counters.
+The executor and the worker never touch the loop's arrays: they post references and read counters. The loop's thread
+does not run in the interpreter (:mod:`srtomo_rtc.hot`).
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ _BLAS = realtime.pin_blas()
 
 import json
 import math
+import os
 import signal
 import threading
 import time
@@ -22,7 +24,6 @@ from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 import numpy as np
@@ -50,6 +51,7 @@ from srtomo_rtc.hot import HotEndpoints
 from srtomo_rtc.hrtc import Hrtc, Snapshot
 from srtomo_rtc.loop import MAX_EPOCHS, Program, Settings
 from srtomo_rtc.swap import Manifest, Refused, Swap
+from srtomo_rtc.vmm import KERNELS, instructions
 
 _ADOPTION_TIMEOUT = 2.0  # s for the loop to take up what was posted: it does between two frames, or at once if idle
 _RESEND_AFTER = 1.0  # s without a new block before missing ones are asked for
@@ -85,6 +87,10 @@ _PARAMETERS: tuple[tuple[str, Any, ParameterDescriptor], ...] = (
         1,
         _integer("exposures that a reconstructor may use; n above 1 take n+1 times the memory", 1, MAX_EPOCHS, True),
     ),
+    ("frame_path", "compiled", _read_only("how slopes come in and commands go out: compiled, or rclpy")),
+    ("kernel", "float32", _read_only("matrix-vector kernel: float32, or int16, half the memory traffic")),
+    ("waiting", "auto", _read_only("how the compiled path waits: blocking, polling, or auto: by the cores there are")),
+    ("cores", "", _read_only("cores that the loop's thread is kept on, as 2,3; empty: any")),
     ("fifo_priority", 0, _integer("SCHED_FIFO priority of the process; 0: normal scheduling", 0, 99, True)),
     ("deadline", 0.0, _read_only("latency above which a frame is a miss, s; 0: the loop's delay less one exposure")),
     ("polc", True, ParameterDescriptor(description="pseudo-open-loop control; false: classical leaky integrator")),
@@ -142,11 +148,11 @@ class HrtcNode(LifecycleNode):
         self._taken_up: tuple[Program | None, int] = (None, 0)  # the newest program that the loop runs, its first frame
         self._refused = 0
         self._realtime: list[realtime.Outcome] = [_BLAS]
+        self._cores: list[int] = []
         self._hrtc: Hrtc | None = None
         self._swap: Swap | None = None
         self._hot: HotEndpoints | None = None
         self._thread: threading.Thread | None = None
-        self._stop = threading.Event()
         self._lifecycle = "unconfigured"
         self.failure: str | None = None
         self.died = False  # the loop's thread ended by an exception
@@ -214,10 +220,25 @@ class HrtcNode(LifecycleNode):
             command_limit=self._value("command_limit"),
             fault_budget=self._value("fault_budget"),
         )
-        swap = Swap(system, layout, G_cal, settings, self._post, self._value("max_epochs"))
+        kernel = self._value("kernel")
+        if kernel not in KERNELS:
+            raise ValueError(f"parameter kernel: expected {' or '.join(KERNELS)}, got {kernel}")
+        try:
+            self._cores = [int(word) for word in self._value("cores").split(",") if word]
+        except ValueError:
+            raise ValueError(f"parameter cores: expected numbers as 2,3, got {self._value('cores')}") from None
+        swap = Swap(system, layout, G_cal, settings, self._post, self._value("max_epochs"), kernel)
         loop = system.loop
         deadline = self._value("deadline") or max(loop.delay - 1, 0.1) / loop.rate
-        hot = HotEndpoints(self._hot_node, wire.COMMAND.depth_at(loop.rate))
+        for name, known in (("frame_path", ("compiled", "rclpy")), ("waiting", ("auto", "blocking", "polling"))):
+            if self._value(name) not in known:
+                raise ValueError(f"parameter {name}: expected {' or '.join(known)}, got {self._value(name)}")
+        hot = HotEndpoints(
+            self._hot_node,
+            wire.COMMAND.depth_at(loop.rate),
+            compiled=self._value("frame_path") == "compiled",
+            waiting=self._value("waiting"),
+        )
         self._hrtc = Hrtc(
             layout,
             loop.delay,
@@ -234,7 +255,10 @@ class HrtcNode(LifecycleNode):
             raise
         self._realtime = [
             _BLAS,
+            hot.outcome,
+            realtime.Outcome("kernel", True, f"{KERNELS[kernel]}, {instructions()}"),
             realtime.lock_memory(),
+            realtime.huge_pages(),
             realtime.quiet_interpreter(),
             realtime.fifo_priority(self._value("fifo_priority")),
         ]
@@ -261,19 +285,25 @@ class HrtcNode(LifecycleNode):
         self._kinds[id(program)] = (EventKind.COMMIT, f"{held.label} from {Path(path).name}")
 
     def _activate(self) -> None:
-        self._stop.clear()
+        assert self._hrtc is not None
+        self._hrtc.stopping = False
         self._thread = threading.Thread(target=self._run, name="loop", daemon=True)
         self._thread.start()
 
     def stop_loop(self) -> None:
         """Open the loop, publish flat, end the loop's thread. From every state; twice does no harm."""
-        self._stop.set()
-        if self._hot is not None:
-            self._hot.wake()
+        self.end_loop()
         if self._thread is not None:
             self._thread.join()
             self._thread = None
             self._publish_changes()
+
+    def end_loop(self) -> None:
+        """Have the loop's thread end, which publishes flat; without waiting for it. Any thread."""
+        hrtc, hot = self._hrtc, self._hot
+        if hrtc is not None and hot is not None:
+            hrtc.stopping = True
+            hot.wake()
 
     def _clean_up(self) -> None:
         self.stop_loop()
@@ -301,24 +331,13 @@ class HrtcNode(LifecycleNode):
         hrtc, hot = self._hrtc, self._hot
         assert hrtc is not None and hot is not None
         try:
-            with hot:
-                hrtc.start()
-                while not self._stop.is_set():
-                    hot.wait(100_000_000)
-                    while True:
-                        message = hot.take()
-                        if message is None:
-                            break
-                        hrtc.offer(message, time.monotonic_ns())
-                    hrtc.advance()
-                    hrtc.idle(time.monotonic_ns())
-                if hrtc.session and (hrtc.loop.closed or hrtc.loop.state.any()):
-                    hrtc.flatten()
+            pinned = realtime.pin_thread(self._cores)
+            self._realtime = [outcome for outcome in self._realtime if outcome.name != pinned.name] + [pinned]
+            hot.run(hrtc)
         except Exception:
             self.died = True
             self.failure = "the loop's thread died: " + traceback.format_exc()
             self.get_logger().fatal(self.failure)
-            self._stop.set()
 
     def _post(self, program: Program) -> None:
         assert self._hrtc is not None
@@ -658,20 +677,39 @@ class HrtcNode(LifecycleNode):
         return DiagnosticStatus.OK, "closed" if hrtc.loop.closed else "open"
 
 
+def _on_signals(react: Callable[[], None]) -> None:
+    """Call ``react`` at once, on a thread of its own, at SIGINT or SIGTERM.
+
+    The main thread would do it only after whatever callback it is in, or has been waiting for.
+    """
+    reader, writer = os.pipe()
+    os.set_blocking(writer, False)
+    signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: None)  # the pipe tells
+
+    def wait() -> None:
+        while os.read(reader, 1):
+            react()
+
+    threading.Thread(target=wait, name="signals", daemon=True).start()
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the node until SIGINT or SIGTERM. ``arguments``: ROS arguments (``--ros-args -p system:=mini ...``)."""
     # rclpy's own handlers shut the context first, after which flat could not be published any more
     rclpy.init(args=None if arguments is None else list(arguments), signal_handler_options=SignalHandlerOptions.NO)
     stop = threading.Event()
-
-    def on_signal(number: int, frame: FrameType | None) -> None:
-        stop.set()
-
-    signal.signal(signal.SIGINT, on_signal)
-    signal.signal(signal.SIGTERM, on_signal)
     node = HrtcNode()
     executor = SingleThreadedExecutor()
     executor.add_node(node)
+
+    def on_signal() -> None:
+        stop.set()
+        node.end_loop()
+        executor.wake()
+
+    _on_signals(on_signal)
     try:
         while not stop.is_set() and not node.died:
             try:

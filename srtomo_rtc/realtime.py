@@ -1,4 +1,4 @@
-"""Real-time settings: each one applied, and reported with the reason where the system refused.
+"""Real-time settings: each one applied, read back, and reported with the reason where the system refused.
 
 Import this module first: :func:`pin_blas` must run before numpy loads.
 """
@@ -10,6 +10,8 @@ import gc
 import os
 import resource
 import sys
+from collections.abc import Collection
+from pathlib import Path
 from typing import NamedTuple
 
 _BLAS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
@@ -46,9 +48,41 @@ def lock_memory() -> Outcome:
         # locking future pages under a limit would turn a later allocation into a crash
         return Outcome(name, False, f"RLIMIT_MEMLOCK is {soft} bytes, needs unlimited")
     libc = ctypes.CDLL(None, use_errno=True)
-    if libc.mlockall(_MCL_CURRENT | _MCL_FUTURE) == 0:
-        return Outcome(name, True, "on")
-    return Outcome(name, False, os.strerror(ctypes.get_errno()))
+    if libc.mlockall(_MCL_CURRENT | _MCL_FUTURE) != 0:
+        return Outcome(name, False, os.strerror(ctypes.get_errno()))
+    locked = _kibibytes("status", "VmLck")
+    return Outcome(name, locked > 0, f"{locked >> 10} MiB" if locked else "the system has locked nothing")
+
+
+def _kibibytes(file: str, field: str) -> int:
+    for line in Path("/proc/self", file).read_text(encoding="ascii").splitlines():
+        if line.startswith(f"{field}:"):
+            return int(line.split()[1])
+    return 0
+
+
+def huge_pages() -> Outcome:
+    """What of the process's memory is on huge pages: the matrices ask for them when they are made."""
+    huge = _kibibytes("smaps_rollup", "AnonHugePages")
+    if huge:
+        return Outcome("huge pages", True, f"{huge >> 10} MiB")
+    setting = Path("/sys/kernel/mm/transparent_hugepage/enabled")
+    try:
+        reason = f"{setting} says {setting.read_text(encoding='ascii').strip()}"
+    except OSError:
+        reason = "this system has none"
+    return Outcome("huge pages", False, reason)
+
+
+def pin_thread(cores: Collection[int]) -> Outcome:
+    """Keep the calling thread on some cores; none: leave it as it is."""
+    name = "affinity of the loop"
+    try:
+        if cores:
+            os.sched_setaffinity(0, cores)
+    except (OSError, ValueError) as error:
+        return Outcome(name, False, str(error))
+    return Outcome(name, True, "cores " + ",".join(map(str, sorted(os.sched_getaffinity(0)))))
 
 
 def fifo_priority(priority: int) -> Outcome:
@@ -56,12 +90,14 @@ def fifo_priority(priority: int) -> Outcome:
     name = "SCHED_FIFO"
     if priority <= 0:
         return Outcome(name, True, "not asked for")
+    threads = [int(thread) for thread in os.listdir("/proc/self/task")]
     try:
-        for thread in os.listdir("/proc/self/task"):
-            os.sched_setscheduler(int(thread), os.SCHED_FIFO, os.sched_param(priority))
+        for thread in threads:
+            os.sched_setscheduler(thread, os.SCHED_FIFO, os.sched_param(priority))
+        found = {(os.sched_getscheduler(thread), os.sched_getparam(thread).sched_priority) for thread in threads}
     except (OSError, ValueError) as error:
         return Outcome(name, False, f"{error} (RLIMIT_RTPRIO)")
-    return Outcome(name, True, str(priority))
+    return Outcome(name, found == {(os.SCHED_FIFO, priority)}, str(priority))
 
 
 def quiet_interpreter() -> Outcome:
@@ -69,4 +105,4 @@ def quiet_interpreter() -> Outcome:
     gc.collect()
     gc.freeze()
     sys.setswitchinterval(0.0005)
-    return Outcome("garbage collection", True, "frozen")
+    return Outcome("garbage collection", gc.get_freeze_count() > 0, "frozen")

@@ -23,8 +23,9 @@ from srtomo_core.reconstructor import Reconstructor, ReconstructorError, block_t
 from srtomo_core.system import System
 from srtomo_rtc.events import PROGRAM_KINDS, EventKind
 from srtomo_rtc.loop import MAX_EPOCHS, Loop, Program, Settings, Slot, Verdict
-from srtomo_rtc.vmm import KERNEL
+from srtomo_rtc.vmm import KERNELS
 
+_NAMED = {name: kernel for kernel, name in KERNELS.items()}
 _TIMED = (Verdict.HOLD_INCOMPLETE, Verdict.HOLD_MISSING, Verdict.HOLD_BEHIND)
 _WINDOW = 400  # frames that the bag's order of messages may be off by
 _SHOWN = 5  # differing frames that are kept for the report
@@ -81,11 +82,12 @@ class Replay:
             raise BagError(f"{reader.path}: does not say which instrument it is of: not recorded by 'srtomo record'?")
         self.system = System.model_validate_json(text)
         self.layout = Layout(self.system)
-        self._slots = {r.sha256: _filled(self.layout, r) for r in supplied or []}
+        self._reconstructors = {r.sha256: r for r in supplied or []}
+        self._slots: dict[tuple[bytes, str], Slot] = {}
         self.events: list[Any] = []
         self.states: dict[_Key, Any] = {}
         self._read_everything_but_frames()
-        self.max_epochs = max((slot.n_epochs for slot in self._slots.values()), default=1)
+        self.max_epochs = max((r.n_epochs for r in self._reconstructors.values()), default=1)
 
     # -- what is not a frame ----------------------------------------------------------------------------------------
 
@@ -110,9 +112,10 @@ class Replay:
                 seen.add(data)
                 self.events.append(decode(wire.EVENT.type, data))
         for event in self.events:
-            if event.kernel and event.kernel != KERNEL:
+            if event.kernel and event.kernel not in _NAMED:
                 raise BagError(
-                    f"{self._reader.path}: made with kernel {event.kernel}, this is {KERNEL}: bits would differ"
+                    f"{self._reader.path}: made with kernel {event.kernel}, here are {' and '.join(_NAMED)}: "
+                    "bits would differ"
                 )
         for data in self._of(wire.STATE):
             state = decode(wire.STATE.type, data)
@@ -159,13 +162,18 @@ class Replay:
             except (ReconstructorError, ValueError):
                 continue  # the HRTC refused it
             if reconstructor.sha256 == sha256:
-                self._slots[sha256] = _filled(self.layout, reconstructor)
+                self._reconstructors[sha256] = reconstructor
 
     def program(self, event: Any) -> Program | None:
         """What the loop runs from an event on; None if its reconstructor is not known."""
-        slot = self._slots.get(bytes(event.sha256))
-        if slot is None:
+        reconstructor = self._reconstructors.get(bytes(event.sha256))
+        if reconstructor is None:
             return None
+        key = reconstructor.sha256, _NAMED.get(event.kernel, "float32")
+        slot = self._slots.get(key)
+        if slot is None:
+            slot = self._slots[key] = Slot(self.layout, reconstructor.n_epochs, key[1])
+            slot.fill(reconstructor)
         return Program(
             slot,
             Settings(
@@ -239,12 +247,6 @@ class Replay:
 
 def _name(verdict: int) -> str:
     return Verdict(verdict).name if verdict in list(Verdict) else str(verdict)
-
-
-def _filled(layout: Layout, reconstructor: Reconstructor) -> Slot:
-    slot = Slot(layout, reconstructor.n_epochs)
-    slot.fill(reconstructor)
-    return slot
 
 
 class _Entry(NamedTuple):

@@ -23,6 +23,7 @@ from srtomo_core.layout import Layout
 from srtomo_core.reconstructor import Reconstructor, ReconstructorError, block_table, n_parts
 from srtomo_core.system import System
 from srtomo_core.wire import ReconstructorBlock
+from srtomo_rtc.compression import INT16_LIMIT, int16_to_noise
 from srtomo_rtc.loop import Program, Settings, Slot
 
 Floats = NDArray[np.float32]
@@ -254,6 +255,7 @@ class Swap:
             else run no frame before: slots are used again.
         max_epochs: exposures that a reconstructor may use: the loop's. Three slots and a transfer have room for so many
             and, with more than one, a fallback: ``4 (max_epochs + 1) n_commands (n_slopes + n_commands)`` floats.
+        kernel: float32, or int16, which holds R in half the memory and refuses what that would spoil.
 
     Raises:
         ValueError: G_cal is not of the instrument's shape.
@@ -267,15 +269,17 @@ class Swap:
         settings: Settings,
         post: Callable[[Program], None],
         max_epochs: int = 1,
+        kernel: str = "float32",
     ) -> None:
         if G_cal.shape != (layout.n_slopes, layout.n_commands):
             raise ValueError(f"G_cal: expected shape {(layout.n_slopes, layout.n_commands)}, got {G_cal.shape}")
-        self._layout = layout
+        self._system, self._layout = system, layout
+        self._kernel = kernel
         self._G_cal = G_cal
         self._sees_tip_tilt, self._sees_focus = seen_low_orders(system, layout)
         self._post = post
         self._max_epochs = max_epochs
-        self._slots = [Slot(layout, max_epochs) for _ in range(3)]
+        self._slots = [Slot(layout, max_epochs, kernel) for _ in range(3)]
         self._manifest: Manifest | None = None
         self._R = np.zeros((n_parts(max_epochs), layout.n_commands, layout.n_slopes), np.float32)
         self._Q = np.zeros((n_parts(max_epochs), layout.n_commands, layout.n_commands), np.float32)
@@ -381,6 +385,8 @@ class Swap:
         """As :meth:`stage`, for a reconstructor that is whole already (from a file)."""
         self._check_epochs(reconstructor.n_epochs)
         result = check(reconstructor, self._layout, self._G_cal, self._sees_tip_tilt, self._sees_focus)
+        if self._kernel == "int16":
+            self._check_int16(reconstructor)
         in_use = {id(held.slot) for held in (self.active, self.previous) if held is not None}
         slot = next(slot for slot in self._slots if id(slot) not in in_use)
         slot.fill(reconstructor)
@@ -391,6 +397,17 @@ class Swap:
     def _check_epochs(self, n_epochs: int) -> None:
         if not 1 <= n_epochs <= self._max_epochs:
             raise Refused(f"uses {n_epochs} exposures; this loop takes {self._max_epochs} (parameter max_epochs)")
+
+    def _check_int16(self, reconstructor: Reconstructor) -> None:
+        try:
+            ratio = max(int16_to_noise(self._system, self._layout, R) for R, _ in reconstructor.parts)
+        except ValueError as error:
+            raise Refused(f"16 bits: {error}") from None
+        if not ratio <= INT16_LIMIT:
+            raise Refused(
+                f"16 bits would err by {ratio:.2g} of what photon noise leaves in the commands, limit {INT16_LIMIT:g}: "
+                "it takes kernel float32"
+            )
 
     def forget(self) -> None:
         """Give the transfer under way up."""

@@ -1,75 +1,80 @@
-"""The matrix-vector kernels of the loop.
+"""The matrix-vector kernels of the loop, which stand in ``native/kernel.c``, and the memory that they read.
 
-A product is a sum of columns in slope order, each element rounded after every multiplication and every addition. No
-order depends on a vector width and no multiply-add is fused, so a kernel gives the same bits on every machine: replays
-and golden bags rely on that. :func:`multiply` holds the matrix by columns, :func:`multiply_tiled` in tiles of rows.
-:func:`multiply_int16` reads half the memory: tiles of 16-bit integers with one float32 scale a row.
+A product is a sum of columns in a fixed order, sub-aperture by sub-aperture (x, then y), each element rounded after
+every multiplication and every addition. No order depends on a vector width or on the packets that slopes come in, and
+no multiply-add is fused, so a kernel gives the same bits on every machine: replays and golden bags rely on that.
+A matrix is held in tiles of rows, whose sums stay in registers while the columns go by.
+:func:`multiply_int16` reads half the memory: 16-bit integers with one float32 scale a row.
 """
 
 from __future__ import annotations
 
+import mmap
 from typing import Any
 
-import numba
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
+
+from srtomo_rtc.native import lib
 
 Floats = NDArray[np.float32]
 Int16s = NDArray[np.int16]
 
-KERNEL = "columns-float32-1thread"
-"""Name, arithmetic and threads; travels in HrtcEvent and in every bag."""
+_TILE_BYTES = 128
+_ROWS = 64  # of the larger tile
 
-
-# fastmath stays off: it would allow fused multiply-adds, whose bits depend on the machine
-@numba.njit("void(f4[:,::1], f4[::1], f4[::1])", nogil=True, cache=True, fastmath=False, error_model="numpy")
-def multiply(columns: Floats, vector: Floats, out: Floats) -> None:
-    """``out = columns.T @ vector``. Any thread; releases the interpreter.
-
-    Args:
-        columns: (n_columns, n_rows) C-contiguous: the matrix by columns.
-        vector: (n_columns,).
-        out: (n_rows,), overwritten.
-    """
-    n_columns, n_rows = columns.shape
-    for i in range(n_rows):
-        out[i] = 0.0
-    j = 0
-    while j + 4 <= n_columns:
-        a, b, c, d = vector[j], vector[j + 1], vector[j + 2], vector[j + 3]
-        for i in range(n_rows):
-            out[i] = (((out[i] + columns[j, i] * a) + columns[j + 1, i] * b) + columns[j + 2, i] * c) + columns[
-                j + 3, i
-            ] * d
-        j += 4
-    while j < n_columns:
-        a = vector[j]
-        for i in range(n_rows):
-            out[i] += columns[j, i] * a
-        j += 1
-
-
-TILE = 64
-"""Rows of a tile: their sums stay in registers while all columns go by."""
-
-KERNEL_TILED = "tiles-float32-1thread"
-KERNEL_INT16 = "tiles-int16-rowscale-1thread"
-"""As :data:`KERNEL`, of :func:`multiply_tiled`, which has its bits, and :func:`multiply_int16`."""
+KERNELS = {"float32": "subapertures-float32-1thread", "int16": "subapertures-int16-rowscale-1thread"}
+"""Name, arithmetic and threads, by parameter ``kernel``; in HrtcEvent and in every bag. The bits belong to the name."""
 
 _INT16_MAX = 32767
+_HUGE = 2 << 20  # bytes of a huge page
 
 
-def tiled(matrix: NDArray[Any]) -> NDArray[Any]:
-    """A matrix (n_rows, n_columns) as C-contiguous tiles (n_tiles, n_columns, TILE) of the same type.
+def instructions() -> str:
+    """The instruction set that the kernels run with here; their bits do not depend on it."""
+    return str(lib.srt_instructions().decode())
 
-    ``tiles[t, j, i] = matrix[t TILE + i, j]``; rows that the last tile has too many are zero. A product then reads
-    memory once, from end to end, which prefetchers follow better than several columns side by side.
+
+def rows_of(n: int) -> int:
+    """Length of a vector that products of ``n`` rows go to: whole tiles of either kind."""
+    return -(-n // _ROWS) * _ROWS
+
+
+def tiles_shape(n_rows: int, n_columns: int, dtype: DTypeLike) -> tuple[int, int, int]:
+    """(n_tiles, n_columns, rows of a tile): 32 rows of float32, 64 of int16."""
+    tile = _TILE_BYTES // np.dtype(dtype).itemsize
+    return -(-n_rows // tile), n_columns, tile
+
+
+def huge_zeros(shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
+    """An array of zeros on huge pages, where the system grants them: fewer page walks in a product."""
+    size = int(np.prod(shape)) * np.dtype(dtype).itemsize
+    if size < _HUGE:
+        return np.zeros(shape, dtype)
+    # from one boundary to another: the system makes a page huge only if all of it is the array's
+    memory = mmap.mmap(-1, -(-size // _HUGE) * _HUGE + _HUGE)
+    if hasattr(mmap, "MADV_HUGEPAGE"):
+        memory.madvise(mmap.MADV_HUGEPAGE)
+    start = -np.frombuffer(memory, np.uint8).ctypes.data % _HUGE
+    return np.frombuffer(memory, dtype, int(np.prod(shape)), start).reshape(shape)
+
+
+def tiled(matrix: NDArray[Any], out: NDArray[Any] | None = None) -> NDArray[Any]:
+    """A matrix (n_rows, n_columns) as C-contiguous tiles (:func:`tiles_shape`) of the same type.
+
+    ``tiles[t, j, i]`` is ``matrix[t n + i, j]`` with n rows a tile; rows that the last tile has too many are zero. A
+    product then reads memory once, from end to end, which prefetchers follow better than several columns side by side.
     """
-    n_rows, n_columns = matrix.shape
-    n_tiles = -(-n_rows // TILE)
-    padded = np.zeros((n_tiles * TILE, n_columns), matrix.dtype)
-    padded[:n_rows] = matrix
-    return np.ascontiguousarray(padded.reshape(n_tiles, TILE, n_columns).transpose(0, 2, 1))
+    tiles = np.zeros(tiles_shape(len(matrix), matrix.shape[1], matrix.dtype), matrix.dtype) if out is None else out
+    for t, tile in enumerate(tiles):
+        rows = matrix[t * tiles.shape[2] : (t + 1) * tiles.shape[2]]
+        tile[:, : len(rows)] = rows.T
+    return tiles
+
+
+def untiled(tiles: NDArray[Any], n_rows: int) -> NDArray[Any]:
+    """The matrix (n_rows, n_columns) that :func:`tiled` made tiles of; a copy."""
+    return tiles.transpose(0, 2, 1).reshape(-1, tiles.shape[1])[:n_rows].copy()
 
 
 def quantise(matrix: NDArray[np.floating]) -> tuple[Int16s, Floats]:
@@ -99,79 +104,41 @@ def quantise(matrix: NDArray[np.floating]) -> tuple[Int16s, Floats]:
     return np.rint(matrix / scales.astype(np.float64)[:, None]).astype(np.int16), scales
 
 
-@numba.njit(
-    ["void(f4[:,::1], f4[::1], f4[::1], i8)", "void(i2[:,::1], f4[::1], f4[::1], i8)"],
-    nogil=True,
-    cache=True,
-    fastmath=False,
-    error_model="numpy",
-)
-def _multiply_tile(tile: NDArray[Any], vector: Floats, out: Floats, n_rows: int) -> None:
-    """The first ``n_rows`` rows of one tile (n_columns, TILE)."""
-    n_columns = len(vector)
-    for i in range(n_rows):
-        out[i] = 0.0
-    j = 0
-    while j + 4 <= n_columns:
-        a, b, c, d = vector[j], vector[j + 1], vector[j + 2], vector[j + 3]
-        for i in range(n_rows):
-            total = out[i]
-            total += np.float32(tile[j, i]) * a
-            total += np.float32(tile[j + 1, i]) * b
-            total += np.float32(tile[j + 2, i]) * c
-            total += np.float32(tile[j + 3, i]) * d
-            out[i] = total
-        j += 4
-    while j < n_columns:
-        a = vector[j]
-        for i in range(n_rows):
-            out[i] += np.float32(tile[j, i]) * a
-        j += 1
-
-
-@numba.njit(
-    ["void(f4[:,:,::1], f4[::1], f4[::1])", "void(i2[:,:,::1], f4[::1], f4[::1])"],
-    nogil=True,
-    cache=True,
-    fastmath=False,
-    error_model="numpy",
-)
-def multiply_tiled(tiles: NDArray[Any], vector: Floats, out: Floats) -> None:
-    """``out = matrix @ vector``, for float32 with the bits of :func:`multiply`. Any thread; releases the interpreter.
+def accumulate(tiles: NDArray[Any], vector: Floats, sums: Floats, first: int = 0, last: int | None = None) -> None:
+    """Add the products of columns ``first`` to ``last`` to ``sums``. Any thread; releases the interpreter.
 
     Args:
         tiles: of the matrix, float32 or int16, as :func:`tiled` makes them.
-        vector: (n_columns,).
-        out: (n_rows,), overwritten.
+        vector: (n_columns,) C-contiguous.
+        sums: C-contiguous, of at least as many rows as the tiles have.
     """
-    n_rows = len(out)
-    for t in range(len(tiles)):
-        start = t * TILE
-        if start + TILE <= n_rows:
-            _multiply_tile(tiles[t], vector, out[start : start + TILE], TILE)
-        else:
-            _multiply_tile(tiles[t], vector, out[start:], n_rows - start)
+    n_tiles, n_columns, _ = tiles.shape
+    function = lib.srt_accumulate if tiles.dtype == np.float32 else lib.srt_accumulate_int16
+    last = n_columns if last is None else last
+    function(tiles.ctypes.data, n_tiles, n_columns, first, last, vector.ctypes.data, sums.ctypes.data)
 
 
-@numba.njit("void(i2[:,:,::1], f4[::1], f4[::1], f4[::1])", nogil=True, cache=True, fastmath=False, error_model="numpy")
+def multiply(tiles: Floats, vector: Floats, out: Floats) -> None:
+    """``out = matrix @ vector``. Any thread; releases the interpreter.
+
+    Args:
+        tiles: as :func:`tiled` makes them.
+        vector: (n_columns,) C-contiguous.
+        out: (:func:`rows_of` n_rows,) C-contiguous, overwritten.
+    """
+    out[:] = 0
+    accumulate(tiles, vector, out)
+
+
 def multiply_int16(tiles: Int16s, scales: Floats, vector: Floats, out: Floats) -> None:
     """``out = scales * (integers @ vector)``, in float32. Any thread; releases the interpreter.
 
     Args:
         tiles: of the integers of :func:`quantise`, as :func:`tiled` makes them.
         scales: (n_rows,).
-        vector: (n_columns,).
-        out: (n_rows,), overwritten.
+        vector: (n_columns,) C-contiguous.
+        out: (:func:`rows_of` n_rows,) C-contiguous, overwritten.
     """
-    multiply_tiled(tiles, vector, out)
-    for i in range(len(out)):
-        out[i] *= scales[i]
-
-
-@numba.njit("b1(f4[::1])", nogil=True, cache=True, fastmath=False)
-def all_finite(vector: Floats) -> bool:
-    """Whether no element is NaN or infinite. Any thread; releases the interpreter."""
-    for value in vector:
-        if not np.isfinite(value):
-            return False
-    return True
+    out[:] = 0
+    accumulate(tiles, vector, out)
+    out[: len(scales)] *= scales

@@ -48,3 +48,6 @@ function(drop_missing_include_directories)
   endforeach()
 endfunction()
 cmake_language(DEFER CALL drop_missing_include_directories)
+
+# pip builds the frame path of srtomo_rtc along with the messages; colcon does not.
+add_subdirectory(${CMAKE_CURRENT_LIST_DIR}/../../srtomo_rtc/native ${CMAKE_CURRENT_BINARY_DIR}/srtomo_frame)

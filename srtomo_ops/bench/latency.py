@@ -22,11 +22,11 @@ from srtomo_core.reconstructor import Reconstructor
 from srtomo_core.system import System
 from srtomo_core.wire import MIRROR_UNKNOWN, DmCommand, SlopeFrameWriter, read_dm_command
 from srtomo_ops.simulate import plain_settings, program_of
+from srtomo_rtc.compression import int16_to_noise
 from srtomo_rtc.hrtc import Hrtc
 from srtomo_rtc.loop import Verdict
-from srtomo_rtc.vmm import multiply, multiply_int16, multiply_tiled, quantise, tiled
+from srtomo_rtc.vmm import huge_zeros, multiply, multiply_int16, quantise, rows_of, tiled, tiles_shape
 from srtomo_sim.mirror import interaction_matrix
-from srtomo_srtc.noise import slope_variance
 
 Floats = NDArray[np.float64]
 
@@ -239,10 +239,10 @@ class Compute:
 
     Attributes:
         latencies: of ``sgemv`` (one product R y, numpy); ``staggered`` and ``burst`` (last message due to command
-            serialised); ``float32``, ``tiled`` and ``int16`` (that kernel alone, over the whole of R).
+            serialised); ``float32`` and ``int16`` (that kernel alone, over the whole of R).
         error: largest error of a command, of the largest of its frame.
         held: frames that the loop held because it was behind.
-        int16_to_noise: see :func:`int16_to_noise`.
+        int16_to_noise: see :func:`srtomo_rtc.compression.int16_to_noise`.
     """
 
     latencies: dict[str, Summary]
@@ -255,12 +255,15 @@ class Compute:
         return self.latencies[name].median / self.latencies["sgemv"].median
 
 
-def wait_until(due_ns: int) -> int:
-    """Wait for a time of the monotonic clock, ns; the time it then is, or ``due_ns`` if that was past already."""
+def wait_until(due_ns: int, awake: bool = False) -> int:
+    """Wait for a time of the monotonic clock, ns; the time it then is, or ``due_ns`` if that was past already.
+
+    ``awake``: without sleeping.
+    """
     now = time.monotonic_ns()
     if now >= due_ns:
         return due_ns
-    if due_ns - now > _SPIN_NS:
+    if due_ns - now > _SPIN_NS and not awake:
         time.sleep((due_ns - now - _SPIN_NS) * 1e-9)
     while (now := time.monotonic_ns()) < due_ns:
         pass
@@ -286,7 +289,12 @@ def measure_compute(problem: Problem, frames: int) -> Compute:
             samples[arrival] += loop.run(arrival, block)
         left -= block
     latencies = {name: Summary.of(values) for name, values in samples.items()}
-    return Compute(latencies, loop.reference.error, loop.reference.held, int16_to_noise(problem))
+    return Compute(
+        latencies,
+        loop.reference.error,
+        loop.reference.held,
+        int16_to_noise(problem.system, problem.layout, problem.reconstructor.R[0]),
+    )
 
 
 class _LoopHere:
@@ -333,16 +341,15 @@ class _LoopHere:
 def _kernels(problem: Problem, period: int) -> dict[str, Callable[[int], list[int]]]:
     """Each measures its product R y a number of times, paced, ns; all are checked against float64 here."""
     R, y = problem.reconstructor.R[0], problem.slopes[0]
-    out = np.empty(len(R), np.float32)
-    by_columns = np.ascontiguousarray(R.T)
-    tiles = tiled(R)
+    padded = np.empty(rows_of(len(R)), np.float32)
+    out = padded[: len(R)]
+    tiles = tiled(R, huge_zeros(tiles_shape(len(R), len(y), np.float32), np.float32))
     integers, scales = quantise(R)
-    tiles_of_integers = tiled(integers)
+    tiles_of_integers = tiled(integers, huge_zeros(tiles_shape(len(R), len(y), np.int16), np.int16))
     products: dict[str, Callable[[], object]] = {
         "sgemv": lambda: np.dot(R, y, out=out),
-        "float32": lambda: multiply(by_columns, y, out),
-        "tiled": lambda: multiply_tiled(tiles, y, out),
-        "int16": lambda: multiply_int16(tiles_of_integers, scales, y, out),
+        "float32": lambda: multiply(tiles, y, padded),
+        "int16": lambda: multiply_int16(tiles_of_integers, scales, y, padded),
     }
     size = np.abs(R).astype(np.float64) @ np.abs(y).astype(np.float64)
     rounding = len(y) * 2.0**-24 * size
@@ -368,22 +375,3 @@ def _kernels(problem: Problem, period: int) -> dict[str, Callable[[int], list[in
         if not np.all(np.abs(out - exact) <= bounds[name]):
             raise ValueError(f"the {name} product is wrong")
     return {name: repeated(product) for name, product in products.items()}
-
-
-def int16_to_noise(problem: Problem) -> float:
-    """Rms error that 16 bits leave in R y, over the rms that the sensors' noise leaves in it; all commands together.
-
-    Slopes are taken as they are without a mirror, which no closed loop exceeds in the long run: the mean tilt of a
-    sub-aperture of side d has a variance of ``0.170 (lambda/d)^2 (d/r0)^(5/3)`` an axis (Kolmogorov; the outer scale
-    makes it less), plus noise.
-    """
-    R = problem.reconstructor.R[0].astype(np.float64)
-    integers, scales = quantise(R)
-    error = integers * scales.astype(np.float64)[:, None] - R
-    noise, tilt = [], []
-    for sensor, layout in zip(problem.system.sensors, problem.layout.sensors, strict=True):
-        noise.append(slope_variance(sensor, layout, problem.system.loop.rate))
-        variance = 0.170 * (500e-9 / layout.size) ** 2 * (layout.size / problem.system.los_r0) ** (5 / 3)
-        tilt.append(np.full(layout.n_slopes, variance))
-    of_noise = np.concatenate(noise)
-    return float(np.sqrt(np.sum(error**2 @ (np.concatenate(tilt) + of_noise)) / np.sum(R**2 @ of_noise)))

@@ -14,9 +14,8 @@ _MEANING = {
     "sgemv": "(a) one float32 product R y, numpy, one core",
     "staggered": "loop, last packet due to command ready",
     "burst": "loop, message due to command ready",
-    "float32": "float32 kernel alone, by columns",
-    "tiled": "float32 kernel alone, in tiles",
-    "int16": "int16 kernel alone, in tiles",
+    "float32": "float32 kernel alone",
+    "int16": "int16 kernel alone",
 }
 """Of Compute.latencies."""
 

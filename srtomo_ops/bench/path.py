@@ -1,7 +1,8 @@
 """Latency of the whole path: slopes published here, taken by another process, its command received here.
 
-The HRTC and an echo that multiplies nothing run at the same time, each in its namespace, and are driven in turns; what
-is not being driven sleeps. Times are the middleware's, on the system's clock, which all processes of a host share.
+The HRTC and an echo run at the same time, each in its namespace, and are driven in turns; what is not being driven
+sleeps. The echo is an HRTC without a reconstructor: it reads slopes and writes commands, and multiplies nothing. Times
+are the middleware's, on the system's clock, which all processes of a host share.
 """
 
 from __future__ import annotations
@@ -152,7 +153,8 @@ class _End:
             messages = sensors.messages(self.frame)
             last = 0
             for message, after in zip(messages, sensors.due_ns, strict=True):
-                wait_until(start + i * self._period + after)
+                # a core that has gone to sleep would be late for the command: that is no latency of the node's
+                wait_until(start + i * self._period + after, awake=True)
                 last = time.time_ns()
                 self._slopes.publish(message)
             sent.append(last)
@@ -174,7 +176,13 @@ class _End:
 
 
 def measure_paths(
-    problem: Problem, name: str, changes: Mapping[str, Any], pairs: int, frames: int, folder: Path
+    problem: Problem,
+    name: str,
+    changes: Mapping[str, Any],
+    pairs: int,
+    frames: int,
+    folder: Path,
+    fifo_priority: int = 0,
 ) -> Paths:
     """Drive HRTC and echo in turns of ``frames`` frames, ``pairs`` pairs of turns for each way of arrival.
 
@@ -182,6 +190,7 @@ def measure_paths(
         name, changes: how the HRTC is to load the instrument.
         pairs: at least 2.
         folder: for matrices, times and the nodes' logs; exists.
+        fifo_priority: SCHED_FIFO priority of both nodes; 0: normal scheduling.
 
     Raises:
         ValueError: a node ended, refused or did not answer; a frame has not exactly one command, in order; or the
@@ -190,20 +199,21 @@ def measure_paths(
     save_interaction_matrix(folder / "gcal.npz", problem.G, problem.layout.fingerprint, {"source": "bench"})
     problem.reconstructor.save(folder / "reconstructor.npz")
     # the outer quotes keep YAML from reading the JSON as a mapping
-    parameters = [f"system:={name}", f"changes:='{json.dumps(dict(changes))}'"]
-    parameters += [f"interaction_matrix:={folder / 'gcal.npz'}", f"reconstructor:={folder / 'reconstructor.npz'}"]
+    common = [f"system:={name}", f"changes:='{json.dumps(dict(changes))}'"]
+    common += [f"interaction_matrix:={folder / 'gcal.npz'}", f"fifo_priority:={fifo_priority}"]
     # a loop that opened would be another measurement; frames that are held are counted
-    parameters.append("fault_budget:=1000000")
-    size = [str(problem.layout.n_commands), str(problem.layout.n_slopes)]
+    own = [f"reconstructor:={folder / 'reconstructor.npz'}", "fault_budget:=1000000"]
     rclpy.init()
     try:
         with Processes(folder) as nodes:
-            nodes.start("echo", ["echo", str(folder / "echo.npy"), *size, *_ros("echo", [])], _NODE)
-            nodes.start("hrtc", ["hrtc", str(folder / "hrtc.npy"), *_ros("hrtc", parameters)], _NODE)
+            for node, parameters in (("echo", common), ("hrtc", common + own)):
+                nodes.start(node, [str(folder / f"{node}.npy"), *_ros(node, parameters)], _NODE)
             ends = {node: _End(node, problem, nodes.check) for node in ("echo", "hrtc")}
-            operator = Operator("hrtc")
-            operator.transition("configure")
-            operator.transition("activate")
+            operators = {node: Operator(node) for node in ends}
+            for each in operators.values():
+                each.transition("configure")
+                each.transition("activate")
+            operator = operators["hrtc"]
             operator.close_loop(True)
             for end in ends.values():
                 end.wait_matched()
@@ -229,7 +239,8 @@ def measure_paths(
                     raise ValueError(f"{node} failed at the end: {nodes.last_line(node)}")
             for end in ends.values():
                 end.destroy()
-            operator.destroy_node()
+            for each in operators.values():
+                each.destroy_node()
     finally:
         rclpy.shutdown()
     received = {node: _received(folder / f"{node}.npy", end.messages) for node, end in ends.items()}

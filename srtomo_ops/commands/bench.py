@@ -45,6 +45,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     loop.add_argument("--frames", type=int, default=250, help="of one turn (default: 250)")
     loop.add_argument("--pairs", type=int, default=10, help="of turns, HRTC and echo, of each arrival (default: 10)")
     loop.add_argument("--packets", type=int, default=4, help="a sensor and frame when staggered (default: 4)")
+    loop.add_argument("--fifo-priority", type=int, default=0, help="SCHED_FIFO of both nodes (default: 0, none)")
     loop.add_argument("--compute-only", action="store_true", help="without processes, without ROS")
     loop.add_argument(
         "--reconstructor", metavar="FILE", type=Path, help="to run (default: least squares, of the same size)"
@@ -122,4 +123,12 @@ def _paths(options: argparse.Namespace, problem: latency.Problem) -> Paths:
 
     with domain_id() as domain, tempfile.TemporaryDirectory(prefix="srtomo-bench-") as folder:
         os.environ["ROS_DOMAIN_ID"] = str(domain)
-        return measure_paths(problem, options.system, changes_of(options), options.pairs, options.frames, Path(folder))
+        return measure_paths(
+            problem,
+            options.system,
+            changes_of(options),
+            options.pairs,
+            options.frames,
+            Path(folder),
+            options.fifo_priority,
+        )

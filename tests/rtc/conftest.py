@@ -112,6 +112,8 @@ class Bench:
         self.sent: list[bytes] = []
         self.labels: dict[int, EventKind] = {}
         self._writer = None if bag is None else BagWriter(bag, {"system": mini.system.model_dump_json()})
+        self._kernel = options.pop("kernel", "float32")
+        self._system = options.pop("system", mini.system)
         self._options = options
         self.configure()
 
@@ -122,7 +124,8 @@ class Bench:
         self.hrtc.start()
         settings = plain_settings(self.layout)
         epochs = self.hrtc.loop.max_epochs
-        self.swap = Swap(self.mini.system, self.layout, self.mini.G, settings, self.hrtc.loop.post, epochs)
+        post = self.hrtc.loop.post
+        self.swap = Swap(self._system, self.layout, self.mini.G, settings, post, epochs, self._kernel)
 
     # -- sensors ----------------------------------------------------------------------------------------------------
 

@@ -45,8 +45,10 @@ def test_memory_is_locked_or_the_reason_told():
         "print(next(line.split()[1] for line in open('/proc/self/status') if line.startswith('VmLck')))"
     )
     outcome, locked = run(code).splitlines()
-    assert (outcome == "memory lock on") == (int(locked) > 0)
-    assert outcome == "memory lock on" or outcome.startswith("memory lock refused: ")
+    if int(locked) == 0:
+        assert outcome.startswith("memory lock refused: ")
+    else:
+        assert outcome == f"memory lock {int(locked) >> 10} MiB"
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="the limit does not bind root")
@@ -73,6 +75,24 @@ def test_priority():
         assert outcome.startswith("SCHED_FIFO refused: ") and "RLIMIT_RTPRIO" in outcome
         assert policy == str(os.SCHED_OTHER)
     assert run(code.format(1000)).startswith("SCHED_FIFO refused: ")
+
+
+def test_affinity():
+    own = min(os.sched_getaffinity(0))
+    code = "from srtomo_rtc import realtime; import os; print(realtime.pin_thread({})); print(os.sched_getaffinity(0))"
+    assert run(code.format([own])).splitlines() == [f"affinity of the loop cores {own}", str({own})]
+    assert run(code.format([])).splitlines()[1] == str(os.sched_getaffinity(0))
+    assert run(code.format([100_000])).startswith("affinity of the loop refused: ")
+
+
+def test_huge_pages_are_counted_or_the_reason_told():
+    code = (
+        "from srtomo_rtc import realtime; from srtomo_rtc.vmm import huge_zeros;"
+        "kept = huge_zeros((16, 1024, 1024), 'f4'); kept[:] = 1; print(realtime.huge_pages())"
+    )
+    outcome = run(code)
+    if not outcome.startswith("huge pages refused: "):
+        assert 60 <= int(outcome.split()[2]) <= 80
 
 
 def test_the_interpreter_is_quiet():

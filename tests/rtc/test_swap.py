@@ -57,8 +57,8 @@ def test_blocks_in_any_order_and_repeated(bench_with_a, mini, helpers):
     held = send(swap, mini.b, helpers, blocks=blocks)
     assert held is swap.staged
     assert (held.slot.id, held.label) == (mini.b.id, "b")
-    R = np.concatenate(held.slot.epochs[0].R).T
-    assert np.array_equal(R, mini.b.R[0]) and np.array_equal(held.slot.epochs[0].Q.T, mini.b.Q[0])
+    R = held.slot.epochs[0].R
+    assert np.array_equal(R, mini.b.R[0]) and np.array_equal(held.slot.epochs[0].Q, mini.b.Q[0])
     assert held.check.stability < 1e-3
     assert_untouched(bench_with_a, mini)
 
@@ -84,7 +84,7 @@ def test_a_new_manifest_during_a_transfer_takes_over(bench_with_a, mini, helpers
     done = [swap.take(block) for pair in zip(helpers.blocks_of(old), helpers.blocks_of(mini.b)) for block in pair]
     assert sum(done) == 1
     assert swap.stage().slot.id == mini.b.id
-    assert np.array_equal(np.concatenate(swap.staged.slot.epochs[0].R).T, mini.b.R[0])
+    assert np.array_equal(swap.staged.slot.epochs[0].R, mini.b.R[0])
 
 
 def test_blocks_without_a_manifest_are_ignored(bench_with_a, mini, helpers):
@@ -250,7 +250,7 @@ def test_every_refusal_of_a_check(bench_with_a, mini):
             swap.stage_whole(reconstructor)
             pytest.fail(name)
         assert swap.staged.slot.id == mini.b.id
-        assert np.array_equal(swap.staged.slot.epochs[0].Q.T, mini.b.Q[0])
+        assert np.array_equal(swap.staged.slot.epochs[0].Q, mini.b.Q[0])
     assert_untouched(bench_with_a, mini)
 
 
@@ -450,8 +450,8 @@ def test_staging_never_touches_a_slot_in_use(bench_with_a, mini):
     for factor in (0.9, 1.1, 1.05):
         swap.stage_whole(built(mini, mini.a.R[0] * factor))
         assert len({id(held.slot) for held in (swap.active, swap.staged, swap.previous)}) == 3
-        assert np.array_equal(swap.active.slot.epochs[0].Q.T, mini.b.Q[0])
-        assert np.array_equal(swap.previous.slot.epochs[0].Q.T, mini.a.Q[0])
+        assert np.array_equal(swap.active.slot.epochs[0].Q, mini.b.Q[0])
+        assert np.array_equal(swap.previous.slot.epochs[0].Q, mini.a.Q[0])
 
 
 def test_settings_go_with_whatever_is_active(bench_with_a, mini):

@@ -1,0 +1,214 @@
+/* The frame path: serialised slopes in, serialised commands out. No allocation once made, no lock, no interpreter.
+ *
+ * law.c holds the control law, gate.c the frame gate around it; ros.c drives both from rcl. What they do is described
+ * where Python wraps them: srtomo_rtc/loop.py and srtomo_rtc/hrtc.py. Structures that Python reads are mirrored in
+ * srtomo_rtc/native.py, which compares srt_abi() with its own sum.
+ *
+ * Threads: one thread, the loop's, calls everything here but srt_loop_post, srt_loop_request, srt_gate_want_snapshot and
+ * the srt_*_next functions, which are for one other thread at a time (or several under the interpreter's lock).
+ * Numbers that others may look at are single aligned words with one writer. */
+#ifndef SRTOMO_FRAME_H
+#define SRTOMO_FRAME_H
+
+#include <stdatomic.h>
+#include <stdbool.h>
+#include <stddef.h>
+#include <stdint.h>
+
+enum {
+    SRT_HISTORY = 64,   /* commands remembered, frames */
+    SRT_AHEAD = 8,      /* frames that may be in assembly at once */
+    SRT_MAX_EPOCHS = 8, /* exposures that a command may be made from */
+    SRT_ROWS = SRT_AHEAD + SRT_MAX_EPOCHS, /* exposures whose slopes are held: those to come and those that were */
+    SRT_MAX_SENSORS = 32,
+};
+
+/* msgs_schema/msg/DmCommand's constants */
+enum srt_verdict {
+    SRT_OK,
+    SRT_OPEN,
+    SRT_HOLD_NONFINITE,
+    SRT_HOLD_INCOMPLETE,
+    SRT_HOLD_MISSING,
+    SRT_HOLD_BEHIND,
+    SRT_HOLD_HISTORY,
+    SRT_VERDICTS,
+};
+
+#define SRT_MIRROR_UNKNOWN INT64_MIN
+
+/* R and Q for one exposure, in tiles (kernel.h). R: of each sensor, its columns in the order x0 y0 x1 y1 ... of its
+ * sub-apertures, so that what has come in order is one run of columns. */
+typedef struct {
+    const void *R[SRT_MAX_SENSORS];
+    const float *R_scales[SRT_MAX_SENSORS]; /* (n_rows) each: R holds 16-bit integers; NULL: float32 */
+    const float *Q;
+} srt_matrices;
+
+/* All that a command is made with. Immutable; vectors have n_rows values (a multiple of the tiles), those beyond the commands zero. */
+typedef struct {
+    uint64_t token;          /* names it in what the loop tells; not 0 */
+    uint64_t reconstructor;  /* id */
+    uint32_t settings;       /* id */
+    uint32_t fault_budget;
+    uint32_t n_epochs;
+    uint32_t polc;
+    float gain, keep, relaxation;
+    const float *offset, *limit;
+    const float *reference, *alone_reference; /* R y_ref: of all epochs, and of the fallback */
+    const srt_matrices *epochs;               /* (n_epochs), the newest exposure first */
+    const srt_matrices *alone;                /* for the newest exposure alone */
+} srt_program;
+
+/* What was on the mirror during an exposure, as in SlopeFrame. */
+typedef struct {
+    int64_t newest, before;
+    float fraction;
+} srt_mirror;
+
+typedef struct {
+    /* for others to look at */
+    int64_t frame, first_frame, answered;
+    int64_t mirror_frame, mirror_frame_before;
+    uint64_t token; /* of the program that runs; 0: none */
+    uint64_t opened_by_faults;
+    float mirror_fraction;
+    uint32_t sensors, used, all_sensors;
+    uint32_t consecutive_holds, n_clipped;
+    int32_t verdict;
+    int32_t closed;
+    atomic_int requested_closed;
+    uint32_t n_sensors, n_commands, n_rows, n_slopes, max_epochs;
+    float *command, *state, *history; /* (n_rows), (n_rows), (SRT_HISTORY, n_rows) */
+
+    /* the loop's own; what stands before is mirrored */
+    _Atomic(const srt_program *) posted;
+    const srt_program *program;
+    const srt_matrices *matrices; /* of the next frame: the newest epoch's, or the fallback's */
+    bool several;                 /* earlier exposures are in the next command */
+    bool finite;                  /* the next frame's slopes so far are */
+    int64_t whole;                /* of the delay, frames */
+    float fraction;               /* of an exposure under the command `whole` frames before, when all is in time */
+    uint32_t n_subapertures[SRT_MAX_SENSORS];
+    uint32_t first_slope[SRT_MAX_SENSORS];
+    uint32_t multiplied[SRT_MAX_SENSORS]; /* sub-apertures whose products are in the sums */
+    float *slopes;                /* (SRT_ROWS, n_slopes): frame k in row k % SRT_ROWS, in R's order */
+    int64_t kept[SRT_ROWS];       /* the frame, if it was answered OK */
+    srt_mirror mirror[SRT_ROWS];
+    float *sums;                  /* (n_sensors, n_rows): R_w y_w so far */
+    float *flat, *on_mirror, *q, *product, *older, *prepared, *trial; /* (n_rows) each */
+} srt_loop;
+
+/* NULL: no memory, or n_sensors above SRT_MAX_SENSORS. */
+srt_loop *srt_loop_new(const uint32_t *n_subapertures, uint32_t n_sensors, uint32_t n_commands, float delay,
+                       uint32_t max_epochs);
+void srt_loop_free(srt_loop *loop);
+void srt_loop_start(srt_loop *loop, int64_t frame, int closed);
+/* Before srt_loop_resume: an earlier exposure that was answered OK. slopes: (n_slopes) sensor by sensor, x then y. */
+void srt_loop_remember(srt_loop *loop, int64_t frame, const float *slopes, int64_t newest, int64_t before,
+                       float fraction);
+void srt_loop_forget(srt_loop *loop);
+void srt_loop_prepare(srt_loop *loop);
+/* One sensor's slopes of the next frame, x then y. */
+void srt_loop_add(srt_loop *loop, uint32_t sensor, const float *slopes);
+/* The sensor's first n sub-apertures of the next frame stand in srt_loop_slopes: form their products. */
+void srt_loop_multiply(srt_loop *loop, uint32_t sensor, uint32_t n);
+int srt_loop_answer(srt_loop *loop, int64_t newest, int64_t before, float fraction);
+int srt_loop_hold(srt_loop *loop, int verdict);
+/* The token of a program that was posted and is now never taken up, or 0. */
+uint64_t srt_loop_post(srt_loop *loop, const srt_program *program);
+void srt_loop_request(srt_loop *loop, int closed);
+int srt_loop_pending(srt_loop *loop);
+
+/* Where a sensor's slopes of a frame stand, in R's order. */
+static inline float *srt_loop_slopes(const srt_loop *loop, int64_t frame, uint32_t sensor)
+{
+    return loop->slopes + (size_t)(frame % SRT_ROWS) * loop->n_slopes + loop->first_slope[sensor];
+}
+
+/* x0 x1 .. y0 y1 .. (anywhere in memory) to x0 y0 x1 y1 .. */
+void srt_interleave(const void *xy, size_t n, float *out);
+
+/* -- gate.c ------------------------------------------------------------------------------------------------------- */
+
+/* Names as in msgs_schema/msg/HrtcStatus. */
+typedef struct {
+    uint64_t commands;
+    uint64_t held_nonfinite, held_incomplete, held_missing, held_behind, held_history;
+    uint64_t dropped_duplicate, dropped_late, dropped_session, dropped_fingerprint, dropped_malformed;
+    uint64_t clipped;
+    uint64_t changes_lost; /* nobody took them in time */
+} srt_counters;
+
+enum { SRT_BINS_PER_OCTAVE = 16, SRT_OCTAVES = 24, SRT_BINS = SRT_BINS_PER_OCTAVE * SRT_OCTAVES };
+
+/* Bins of 1/16 octave from 1 us; the first holds everything below too. */
+typedef struct {
+    int64_t deadline_ns, misses, max_ns;
+    int64_t counts[SRT_BINS];
+} srt_latency;
+
+void srt_latency_add(srt_latency *latency, int64_t ns);
+
+enum srt_what { SRT_SESSION, SRT_PROGRAM, SRT_LOOP };
+enum srt_reason { SRT_ASKED, SRT_FAULTS, SRT_NEW_SESSION, SRT_GOES_ON };
+
+/* Something that the loop took up. */
+typedef struct {
+    uint64_t session, token;
+    int64_t frame;
+    int64_t number; /* for the reason: frames held in a row, or the frame that was due */
+    int32_t what, reason, closed;
+} srt_change;
+
+/* The loop after a frame: msgs_schema/msg/HrtcState. */
+typedef struct {
+    uint64_t session, token;
+    int64_t frame, first_frame;
+    int32_t stamp_sec;
+    uint32_t stamp_nanosec;
+    uint32_t consecutive_holds;
+    int32_t closed;
+    float *state, *history; /* (n_rows), (SRT_HISTORY, n_rows) in the loop's order */
+} srt_snapshot;
+
+/* Not 0: the message did not go out. */
+typedef int (*srt_publish)(void *context, const uint8_t *message, size_t size);
+
+typedef struct {
+    srt_loop *loop;
+    uint64_t session;
+    int64_t last_slopes_ns;
+    srt_counters counters;
+    srt_latency latency;
+    size_t largest_message; /* a SlopeFrame with every sensor, bytes; its frame_id takes at most 256 */
+    srt_publish publish;
+    void *publish_context;
+    int32_t failure;  /* the first nonzero that publish returned since this was set to 0 */
+    atomic_int stop;  /* for srt_run */
+} srt_gate;
+
+srt_gate *srt_gate_new(const uint32_t *n_subapertures, uint32_t n_sensors, uint32_t n_commands, float delay,
+                       uint32_t max_epochs, const uint8_t fingerprint[32], int64_t deadline_ns, int64_t max_behind);
+void srt_gate_free(srt_gate *gate);
+void srt_gate_start(srt_gate *gate);
+/* The frame of a message that fits the instrument, used or not; -1: it does not. */
+int64_t srt_gate_offer(srt_gate *gate, const uint8_t *message, size_t size, int64_t now_ns);
+void srt_gate_advance(srt_gate *gate);
+void srt_gate_idle(srt_gate *gate, int64_t now_ns);
+/* Whether anything is on the mirror that a stopping loop has to take off. */
+int srt_gate_not_flat(const srt_gate *gate);
+void srt_gate_flatten(srt_gate *gate);
+/* False: none waits. */
+int srt_gate_next_change(srt_gate *gate, srt_change *out);
+void srt_gate_want_snapshot(srt_gate *gate);
+/* NULL: none waits. It stays as it is until srt_gate_snapshot_done. */
+const srt_snapshot *srt_gate_next_snapshot(srt_gate *gate);
+void srt_gate_snapshot_done(srt_gate *gate);
+
+int64_t srt_now(void); /* monotonic, ns */
+
+/* Sum of the mirrored structures' sizes; of srt_loop up to `posted`. */
+size_t srt_abi(void);
+
+#endif

@@ -1,0 +1,395 @@
+#include "frame.h"
+
+#include <math.h>
+#include <stdlib.h>
+#include <string.h>
+
+#include "kernel.h"
+
+static float *floats(size_t n)
+{
+    size_t bytes = (n * sizeof(float) + 63) / 64 * 64;
+    float *made = aligned_alloc(64, bytes ? bytes : 64);
+    if (made)
+        memset(made, 0, bytes);
+    return made;
+}
+
+static void zero(float *values, size_t n)
+{
+    memset(values, 0, n * sizeof *values);
+}
+
+static void copy(float *to, const float *from, size_t n)
+{
+    memcpy(to, from, n * sizeof *to);
+}
+
+static void expect_in_time(srt_loop *loop);
+
+srt_loop *srt_loop_new(const uint32_t *n_subapertures, uint32_t n_sensors, uint32_t n_commands, float delay,
+                       uint32_t max_epochs)
+{
+    if (n_sensors > SRT_MAX_SENSORS || max_epochs < 1 || max_epochs > SRT_MAX_EPOCHS)
+        return NULL;
+    srt_loop *loop = calloc(1, sizeof *loop);
+    if (!loop)
+        return NULL;
+    loop->n_sensors = n_sensors;
+    loop->all_sensors = (uint32_t)((1ull << n_sensors) - 1);
+    loop->n_commands = n_commands;
+    loop->n_rows = (n_commands + SRT_TILE_INT16 - 1) / SRT_TILE_INT16 * SRT_TILE_INT16;
+    loop->max_epochs = max_epochs;
+    for (uint32_t w = 0; w < n_sensors; w++) {
+        loop->n_subapertures[w] = n_subapertures[w];
+        loop->first_slope[w] = loop->n_slopes;
+        loop->n_slopes += 2 * n_subapertures[w];
+    }
+    loop->whole = (int64_t)floorf(delay);
+    loop->fraction = (float)(1.0 - ((double)delay - (double)loop->whole));
+    size_t m = loop->n_rows;
+    float **vectors[] = {&loop->command, &loop->state, &loop->flat, &loop->on_mirror, &loop->q,
+                         &loop->product, &loop->older, &loop->prepared, &loop->trial};
+    bool complete = (loop->history = floats(SRT_HISTORY * m)) && (loop->sums = floats(n_sensors * m)) &&
+                    (loop->slopes = floats((size_t)SRT_ROWS * loop->n_slopes));
+    for (size_t i = 0; i < sizeof vectors / sizeof *vectors; i++)
+        complete = (*vectors[i] = floats(m)) && complete;
+    if (!complete) {
+        srt_loop_free(loop);
+        return NULL;
+    }
+    srt_loop_start(loop, 0, 0);
+    return loop;
+}
+
+void srt_loop_free(srt_loop *loop)
+{
+    if (!loop)
+        return;
+    float *owned[] = {loop->command, loop->state,   loop->flat,    loop->on_mirror, loop->q,    loop->product,
+                      loop->older,   loop->prepared, loop->trial, loop->history,   loop->sums, loop->slopes};
+    for (size_t i = 0; i < sizeof owned / sizeof *owned; i++)
+        free(owned[i]);
+    free(loop);
+}
+
+void srt_interleave(const void *xy, size_t n, float *out)
+{
+    const char *x = xy, *y = x + n * sizeof(float);
+    for (size_t i = 0; i < n; i++) {
+        memcpy(out + 2 * i, x + i * sizeof(float), sizeof(float));
+        memcpy(out + 2 * i + 1, y + i * sizeof(float), sizeof(float));
+    }
+}
+
+/* -- from any thread ---------------------------------------------------------------------------------------------- */
+
+uint64_t srt_loop_post(srt_loop *loop, const srt_program *program)
+{
+    const srt_program *before = atomic_exchange(&loop->posted, program);
+    return before ? before->token : 0;
+}
+
+void srt_loop_request(srt_loop *loop, int closed)
+{
+    atomic_store(&loop->requested_closed, closed);
+}
+
+int srt_loop_pending(srt_loop *loop)
+{
+    return atomic_load(&loop->posted) != NULL ||
+           (atomic_load(&loop->requested_closed) && loop->token) != (loop->closed != 0);
+}
+
+/* -- from the loop's thread --------------------------------------------------------------------------------------- */
+
+void srt_loop_forget(srt_loop *loop)
+{
+    for (int row = 0; row < SRT_ROWS; row++)
+        loop->kept[row] = -1;
+}
+
+static void no_sensor_came(srt_loop *loop)
+{
+    loop->sensors = 0;
+    loop->finite = true;
+    memset(loop->multiplied, 0, sizeof loop->multiplied);
+    zero(loop->sums, (size_t)loop->n_sensors * loop->n_rows);
+}
+
+void srt_loop_start(srt_loop *loop, int64_t frame, int closed)
+{
+    loop->frame = loop->first_frame = frame;
+    loop->closed = closed;
+    atomic_store(&loop->requested_closed, closed);
+    loop->consecutive_holds = 0;
+    loop->used = 0;
+    loop->answered = -1;
+    loop->verdict = SRT_OPEN;
+    loop->n_clipped = 0;
+    zero(loop->state, loop->n_rows);
+    zero(loop->history, (size_t)SRT_HISTORY * loop->n_rows);
+    srt_loop_forget(loop);
+    loop->several = false;
+    no_sensor_came(loop);
+    expect_in_time(loop);
+}
+
+static void keep(srt_loop *loop, int64_t frame, bool kept, srt_mirror mirror)
+{
+    loop->kept[frame % SRT_ROWS] = kept ? frame : -1;
+    loop->mirror[frame % SRT_ROWS] = mirror;
+}
+
+void srt_loop_remember(srt_loop *loop, int64_t frame, const float *slopes, int64_t newest, int64_t before,
+                       float fraction)
+{
+    for (uint32_t w = 0; w < loop->n_sensors; w++)
+        srt_interleave(slopes + loop->first_slope[w], loop->n_subapertures[w], srt_loop_slopes(loop, frame, w));
+    keep(loop, frame, true, (srt_mirror){newest, before, fraction});
+}
+
+static const float *shown(const srt_loop *loop, int64_t frame)
+{
+    return frame >= loop->first_frame ? loop->history + (size_t)(frame % SRT_HISTORY) * loop->n_rows : loop->flat;
+}
+
+/* Of float32. */
+static size_t n_tiles(const srt_loop *loop)
+{
+    return (loop->n_commands + SRT_TILE - 1) / SRT_TILE;
+}
+
+/* R_w y for columns first .. last - 1 of one sensor, onto sums; 16-bit integers are not scaled yet. */
+static void accumulate(const srt_loop *loop, const srt_matrices *matrices, uint32_t sensor, size_t first, size_t last,
+                       const float *slopes, float *sums)
+{
+    size_t columns = 2 * (size_t)loop->n_subapertures[sensor];
+    if (matrices->R_scales[sensor])
+        srt_accumulate_int16(matrices->R[sensor], loop->n_rows / SRT_TILE_INT16, columns, first, last, slopes, sums);
+    else
+        srt_accumulate(matrices->R[sensor], n_tiles(loop), columns, first, last, slopes, sums);
+}
+
+/* total += sums of one sensor, scaled if they are of integers. */
+static void add_scaled(const srt_loop *loop, const srt_matrices *matrices, uint32_t sensor, const float *sums,
+                       float *restrict total)
+{
+    const float *scales = matrices->R_scales[sensor];
+    if (scales)
+        for (size_t i = 0; i < loop->n_rows; i++)
+            total[i] += scales[i] * sums[i];
+    else
+        for (size_t i = 0; i < loop->n_rows; i++)
+            total[i] += sums[i];
+}
+
+/* out = Q u~ with the state that was on the mirror. */
+static void multiply_mirror(srt_loop *loop, const float *Q, srt_mirror mirror, float *out)
+{
+    size_t m = loop->n_rows;
+    const float *newest = shown(loop, mirror.newest), *before = shown(loop, mirror.before);
+    const float *offset = loop->program->offset;
+    float share = mirror.fraction, rest = 1.0f - share, *restrict u = loop->on_mirror;
+    for (size_t i = 0; i < m; i++)
+        u[i] = (share * newest[i] + rest * before[i]) - offset[i];
+    zero(out, m);
+    srt_accumulate(Q, n_tiles(loop), loop->n_commands, 0, loop->n_commands, u, out);
+}
+
+static bool kept_back(const srt_loop *loop, int64_t n)
+{
+    for (int64_t frame = loop->frame - n; frame < loop->frame; frame++)
+        if (frame < 0 || loop->kept[frame % SRT_ROWS] != frame)
+            return false;
+    return true;
+}
+
+/* The part of c that earlier exposures make, if the program uses them and all are here. */
+static void form_older(srt_loop *loop)
+{
+    const srt_program *program = loop->program;
+    loop->several = program && program->n_epochs > 1 && kept_back(loop, program->n_epochs - 1);
+    loop->matrices = !program ? NULL : loop->several ? program->epochs : program->alone;
+    if (!loop->several)
+        return;
+    zero(loop->older, loop->n_rows);
+    for (uint32_t j = 1; j < program->n_epochs; j++) {
+        const srt_matrices *matrices = program->epochs + j;
+        int64_t frame = loop->frame - j;
+        for (uint32_t w = 0; w < loop->n_sensors; w++) {
+            zero(loop->product, loop->n_rows);
+            accumulate(loop, matrices, w, 0, 2 * (size_t)loop->n_subapertures[w], srt_loop_slopes(loop, frame, w),
+                       loop->product);
+            add_scaled(loop, matrices, w, loop->product, loop->older);
+        }
+        if (program->polc) {
+            multiply_mirror(loop, matrices->Q, loop->mirror[frame % SRT_ROWS], loop->product);
+            for (size_t i = 0; i < loop->n_rows; i++)
+                loop->older[i] += loop->product[i];
+        }
+    }
+}
+
+/* c, with what was on the mirror in this exposure. */
+static void expect(srt_loop *loop, srt_mirror mirror)
+{
+    loop->mirror_frame = mirror.newest;
+    loop->mirror_frame_before = mirror.before;
+    loop->mirror_fraction = mirror.fraction;
+    const srt_program *program = loop->program;
+    if (!program)
+        return;
+    size_t m = loop->n_rows;
+    float *restrict q = loop->q;
+    if (program->polc)
+        multiply_mirror(loop, loop->matrices->Q, mirror, q);
+    else
+        zero(q, m);
+    const float *reference = program->alone_reference;
+    if (loop->several) {
+        for (size_t i = 0; i < m; i++)
+            q[i] += loop->older[i];
+        reference = program->reference;
+    }
+    float kept = program->keep, gain = program->gain, *restrict prepared = loop->prepared;
+    const float *state = loop->state;
+    for (size_t i = 0; i < m; i++)
+        prepared[i] = kept * state[i] + gain * (q[i] - reference[i]);
+}
+
+static void expect_in_time(srt_loop *loop)
+{
+    expect(loop, (srt_mirror){loop->frame - loop->whole, loop->frame - loop->whole - 1, loop->fraction});
+}
+
+void srt_loop_prepare(srt_loop *loop)
+{
+    const srt_program *posted = atomic_exchange(&loop->posted, NULL);
+    if (posted) {
+        loop->program = posted;
+        loop->token = posted->token;
+    }
+    loop->closed = atomic_load(&loop->requested_closed) && loop->program;
+    no_sensor_came(loop);
+    form_older(loop);
+    expect_in_time(loop);
+}
+
+void srt_loop_multiply(srt_loop *loop, uint32_t sensor, uint32_t n)
+{
+    const float *slopes = srt_loop_slopes(loop, loop->frame, sensor);
+    size_t first = 2 * (size_t)loop->multiplied[sensor], last = 2 * (size_t)n;
+    loop->finite = srt_all_finite(slopes + first, last - first) && loop->finite;
+    if (loop->program)
+        accumulate(loop, loop->matrices, sensor, first, last, slopes, loop->sums + (size_t)sensor * loop->n_rows);
+    loop->multiplied[sensor] = n;
+    if (n == loop->n_subapertures[sensor])
+        loop->sensors |= 1u << sensor;
+}
+
+void srt_loop_add(srt_loop *loop, uint32_t sensor, const float *slopes)
+{
+    uint32_t n = loop->n_subapertures[sensor];
+    srt_interleave(slopes, n, srt_loop_slopes(loop, loop->frame, sensor));
+    loop->multiplied[sensor] = 0;
+    zero(loop->sums + (size_t)sensor * loop->n_rows, loop->n_rows);
+    srt_loop_multiply(loop, sensor, n);
+}
+
+static void relax(srt_loop *loop)
+{
+    float share = 1.0f - loop->program->relaxation, *state = loop->state;
+    for (size_t i = 0; i < loop->n_rows; i++) {
+        float value = state[i] * share;
+        state[i] = fabsf(value) < 1e-12f ? 0.0f : value; /* a picometre: do not decay into denormals */
+    }
+}
+
+/* m = clip(u + o), u = m - o where that changed anything. */
+static void clip(srt_loop *loop)
+{
+    const float *offset = loop->program->offset, *limit = loop->program->limit;
+    float *restrict state = loop->state, *restrict command = loop->command;
+    uint32_t clipped = 0;
+    for (size_t i = 0; i < loop->n_rows; i++) {
+        float wanted = state[i] + offset[i];
+        float m = wanted > limit[i] ? limit[i] : wanted < -limit[i] ? -limit[i] : wanted;
+        bool over = m != wanted;
+        state[i] = over ? m - offset[i] : state[i];
+        command[i] = m;
+        clipped += over;
+    }
+    loop->n_clipped = clipped;
+}
+
+static int finish(srt_loop *loop, int verdict)
+{
+    const srt_program *program = loop->program;
+    if (verdict == SRT_OK || verdict == SRT_OPEN)
+        loop->consecutive_holds = 0;
+    else
+        loop->consecutive_holds++;
+    if (program) {
+        if (!loop->closed)
+            relax(loop);
+        clip(loop);
+        if (loop->closed && loop->consecutive_holds > program->fault_budget) {
+            srt_loop_request(loop, 0);
+            loop->opened_by_faults++;
+        }
+    }
+    int64_t frame = loop->frame;
+    copy(loop->history + (size_t)(frame % SRT_HISTORY) * loop->n_rows, loop->command, loop->n_rows);
+    keep(loop, frame, verdict == SRT_OK,
+         (srt_mirror){loop->mirror_frame, loop->mirror_frame_before, loop->mirror_fraction});
+    loop->verdict = verdict;
+    loop->used = loop->sensors;
+    loop->answered = frame;
+    loop->frame = frame + 1;
+    loop->sensors = 0;
+    return verdict;
+}
+
+/* Whether a command is in the history, and still will be when this exposure is the oldest that is used. */
+static bool known(const srt_loop *loop, int64_t frame)
+{
+    int64_t oldest = loop->frame - SRT_HISTORY + loop->max_epochs - 1;
+    if (oldest < loop->first_frame)
+        oldest = loop->first_frame;
+    return frame == -1 || (oldest <= frame && frame < loop->frame);
+}
+
+int srt_loop_answer(srt_loop *loop, int64_t newest, int64_t before, float fraction)
+{
+    if (!loop->closed)
+        return finish(loop, SRT_OPEN);
+    const srt_program *program = loop->program;
+    if (!loop->finite)
+        return finish(loop, SRT_HOLD_NONFINITE);
+    if (program->polc && newest != SRT_MIRROR_UNKNOWN) {
+        if (!(known(loop, newest) && (fraction == 1.0f || known(loop, before)) && fraction >= 0.0f &&
+              fraction <= 1.0f))
+            return finish(loop, SRT_HOLD_HISTORY);
+        if (newest != loop->mirror_frame || fraction != loop->mirror_fraction ||
+            (fraction != 1.0f && before != loop->mirror_frame_before))
+            expect(loop, (srt_mirror){newest, before, fraction});
+    }
+    size_t m = loop->n_rows;
+    float gain = program->gain, *restrict total = loop->product, *restrict trial = loop->trial;
+    const float *prepared = loop->prepared;
+    zero(total, m);
+    for (uint32_t w = 0; w < loop->n_sensors; w++)
+        add_scaled(loop, loop->matrices, w, loop->sums + (size_t)w * m, total);
+    for (size_t i = 0; i < m; i++)
+        trial[i] = prepared[i] + gain * total[i];
+    if (!srt_all_finite(trial, m))
+        return finish(loop, SRT_HOLD_NONFINITE);
+    copy(loop->state, trial, m);
+    return finish(loop, SRT_OK);
+}
+
+int srt_loop_hold(srt_loop *loop, int verdict)
+{
+    return finish(loop, verdict);
+}
