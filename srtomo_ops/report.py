@@ -17,6 +17,7 @@ from srtomo_core.bag import BagReader
 from srtomo_core.layout import Layout
 from srtomo_core.system import System
 from srtomo_srtc.design import Cut, Design
+from srtomo_srtc.learn import Learned
 
 
 def demo_figure(
@@ -83,3 +84,57 @@ def design_figure(path: Path, title: str, found: Design, lines: Sequence[Cut], a
     figure.tight_layout()
     figure.savefig(path, dpi=110)
     plt.close(figure)
+
+
+def sky_figure(path: Path, system: System, learned: Learned) -> None:
+    """The profile against altitude, and measured against fitted covariance of slopes."""
+    figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4.4))
+    kilometres = learned.altitudes / 1e3
+    left.barh(kilometres, learned.fractions, height=0.3, color="lightgrey", label="best fit, layer by layer")
+    for i, group in enumerate(learned.groups):
+        ends = kilometres[[group.layers[0], group.layers[-1]]]
+        ends += np.array([-0.3, 0.3])
+        label = "told apart, 1 sigma" if i == 0 else None
+        interval = group.fraction - group.sigma, group.fraction + group.sigma
+        left.fill_betweenx(ends, *interval, color="tab:blue", alpha=0.4, lw=0, label=label)
+        left.plot([group.fraction] * 2, ends, color="tab:blue")
+    left.set(xlabel="share of Cn2", ylabel="altitude [km above the telescope]", xlim=(0, None),
+             title=f"{system.name}: r0 {100 * learned.r0:.1f} +- {100 * learned.r0_sigma:.1f} cm")  # fmt: skip
+    left.legend(fontsize=8)
+    for name, colour, (length, measured, fitted) in zip(
+        ("one sensor", "two sensors"), ("tab:red", "tab:green"), _by_baseline(learned), strict=True
+    ):
+        right.plot(length, measured, "o", ms=4, color=colour, label=f"{name}, measured")
+        right.plot(length, fitted, color=colour, lw=1, label=f"{name}, fitted")
+    right.set(xlabel="baseline in the pupil [m]", ylabel="covariance of slopes, x or y [rad$^2$]",
+              title="mean over directions; noise at 0")  # fmt: skip
+    right.legend(fontsize=8)
+    figure.tight_layout()
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
+def _by_baseline(learned: Learned) -> list[tuple[Any, Any, Any]]:
+    """Within a sensor, and between sensors: baselines (n,) m, measured and fitted covariance at them, rad^2."""
+    parts = learned.sampling.parts
+    starts = np.cumsum([0] + [part.place.n_slopes for part in parts])
+    size = min(part.place.size for part in parts)
+    sums = np.zeros((2, 3, 1 + 2 * max(len(part.place.mask) for part in parts)))
+    for i, a in enumerate(parts):
+        for j, b in enumerate(parts):
+            if a.place.size != size or b.place.size != size:
+                continue
+            (ax, ay), (bx, by) = (part.place.to_pupil(*part.place.local.T) for part in (a, b))
+            bins = np.rint(np.hypot(ax[:, None] - bx, ay[:, None] - by) / size).astype(int).ravel()
+            kind = sums[int(a.sensor != b.sensor)]
+            for axis in range(2):
+                rows = slice(starts[i] + axis * a.place.n_valid, starts[i] + (axis + 1) * a.place.n_valid)
+                columns = slice(starts[j] + axis * b.place.n_valid, starts[j] + (axis + 1) * b.place.n_valid)
+                for row, values in enumerate((learned.measured, learned.fitted)):
+                    kind[row] += np.bincount(bins, values[rows, columns].ravel(), len(kind[row]))
+                kind[2] += np.bincount(bins, minlength=len(kind[2]))
+    out = []
+    for measured, fitted, count in sums:
+        seen = count > 0
+        out.append((size * np.flatnonzero(seen), measured[seen] / count[seen], fitted[seen] / count[seen]))
+    return out

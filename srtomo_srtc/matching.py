@@ -45,6 +45,11 @@ class Matched(NamedTuple):
     verdict: int
     n_clipped: int
 
+    @property
+    def closed(self) -> bool:
+        """Whether the loop was closed, held answers included."""
+        return self.verdict != _OPEN
+
 
 @dataclass
 class Tally:

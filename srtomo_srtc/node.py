@@ -1,7 +1,9 @@
-"""The SRTC as a ROS 2 node: builds reconstructors from its priors and publishes them on request.
+"""The SRTC as a ROS 2 node: builds reconstructors from its priors, and learns better ones from telemetry.
 
-It computes with one BLAS thread under SCHED_IDLE, so that the loop beside it is not disturbed. It does not commit: that
-is the operator's call.
+It computes with one BLAS thread under SCHED_IDLE, so that the loop beside it is not disturbed. Reconstructors are
+published on request, by label or id; with ``learn`` also whenever one proves better on telemetry, and with
+``auto_commit`` they are committed and rolled back as well. Three threads: the executor's, which carries messages; the
+listener, which takes telemetry off the wire; the worker, which fits and builds.
 """
 
 from __future__ import annotations
@@ -15,36 +17,62 @@ for _variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", 
 import json
 import signal
 import threading
+import time
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from functools import partial
 from types import FrameType
 from typing import Any
 
 import rclpy
-from msgs_schema.msg import AtmosphereProfile
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from msgs_schema.msg import AtmosphereProfile, HrtcStatus, ModelHealth
 from msgs_schema.msg import Reconstructor as ReconstructorMsg
 from msgs_schema.msg import ReconstructorBlock as ReconstructorBlockMsg
-from msgs_schema.srv import PublishReconstructor
+from msgs_schema.srv import PublishReconstructor, SwapReconstructor
 from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from rclpy.signals import SignalHandlerOptions
+from rclpy.task import Future
 
 from srtomo_core import wire
-from srtomo_core.reconstructor import Reconstructor, block_table
+from srtomo_core.layout import Layout
+from srtomo_core.reconstructor import Reconstructor, ReconstructorError, block_table, load_interaction_matrix
 from srtomo_core.system import InstrumentError, System, load_system
+from srtomo_srtc.decide import Rules
+from srtomo_srtc.learner import Belief, Judgement, Learner, Outcome, lags_of, learned_sky
+from srtomo_srtc.listener import Listener
 from srtomo_srtc.model import ground_prior
-from srtomo_srtc.reconstructors import implicit
+from srtomo_srtc.reconstructors import implicit, predictive
+from srtomo_srtc.report import believed_fields, diagnosis, health_fields, learned_fields
+from srtomo_srtc.telemetry import COUNTED_RATE, Statistics, Telemetry
+from srtomo_srtc.wind import effective_lag
+from srtomo_srtc.worker import Worker
 
 PRIORS: dict[str, Callable[[System], System]] = {"file": lambda system: system, "ground": ground_prior}
 """What a reconstructor may suppose of the sky: the instrument file's profile, or all turbulence at the ground."""
 
+METHODS: dict[str, Callable[..., tuple[Reconstructor, Any]]] = {"implicit": implicit, "predictive": predictive}
+
+_LEARNED = "learned"
+_STAGING = 30.0  # s that the HRTC may take to stage a reconstructor
 
 _PARAMETERS: tuple[tuple[str, Any, str], ...] = (
     ("system", "", "instrument: name or path of a .yaml file"),
     ("changes", "{}", 'changes to the instrument as JSON, e.g. {"loop.rate": "1 kHz"}'),
     ("priors", ["file"], f"reconstructors to build at the start, by prior: {', '.join(PRIORS)}"),
+    ("method", "implicit", f"of all reconstructors: {', '.join(METHODS)}"),
+    ("interaction_matrix", "", "path of the calibrated interaction matrix (srtomo calibrate); empty: the model's own"),
+    ("learn", False, "learn the sky from telemetry, and publish reconstructors that are better by it"),
+    ("auto_commit", False, "commit what was learned, and roll back what proves worse; false: leave that to operators"),
+    ("window", 16.0, "telemetry that a sky is learned from, s; each window is judged once"),
+    ("every", 10.0, "from one swap to the next at least, s"),
+    ("floor", 1.0, "wavefront error that a swap has to gain by prediction, nm rms"),
+    ("pause", 60.0, "from a roll-back to the next swap, s"),
 )
+_LEAST = {"window": 0.1, "every": 0.1, "floor": 0.0, "pause": 0.0}
 
 
 def parameters() -> Iterable[tuple[str, Any, str]]:
@@ -52,67 +80,109 @@ def parameters() -> Iterable[tuple[str, Any, str]]:
     return _PARAMETERS
 
 
+@dataclass
+class _Order:
+    """A swap that is to be made.
+
+    Attributes:
+        roll_back: to the HRTC's previous reconstructor; otherwise a commit of its staged one.
+        until: when it is given up, s of the monotonic clock.
+        called: the HRTC was asked.
+    """
+
+    reconstructor: Reconstructor
+    roll_back: bool
+    until: float
+    called: bool = False
+
+    @property
+    def text(self) -> str:
+        """What it is."""
+        return f"{'roll back to' if self.roll_back else 'commit'} {self.reconstructor.id:016x}"
+
+
 class SrtcNode(Node):
-    """The node ``srtc``. Everything runs on the executor's thread."""
+    """The node ``srtc``. Its methods run on the executor's thread."""
 
     def __init__(self) -> None:
         super().__init__("srtc")
         for name, default, description in parameters():
             self.declare_parameter(name, default, ParameterDescriptor(description=description, read_only=True))
-        self._manifests = self.create_publisher(
-            ReconstructorMsg, wire.RECONSTRUCTOR.name, QoSProfile(**wire.RECONSTRUCTOR.qos())
-        )
-        self._blocks = self.create_publisher(
-            ReconstructorBlockMsg, wire.RECONSTRUCTOR_BLOCK.name, QoSProfile(**wire.RECONSTRUCTOR_BLOCK.qos())
-        )
-        self._profiles = self.create_publisher(AtmosphereProfile, wire.PROFILE.name, QoSProfile(**wire.PROFILE.qos()))
-        self._built: dict[str, tuple[System, Reconstructor]] = {}
+        self._manifests = self._publisher(ReconstructorMsg, wire.RECONSTRUCTOR)
+        self._blocks = self._publisher(ReconstructorBlockMsg, wire.RECONSTRUCTOR_BLOCK)
+        self._profiles = self._publisher(AtmosphereProfile, wire.PROFILE)
+        self._healths = self._publisher(ModelHealth, wire.HEALTH)
+        self._diagnostics = self._publisher(DiagnosticArray, wire.DIAGNOSTICS)
+        self._built: dict[str, Belief] = {}
+        self._worker: Worker | None = None
+        self._listener: Listener | None = None
+
+    def _publisher(self, kind: type, topic: wire.Topic) -> Any:
+        return self.create_publisher(kind, topic.name, QoSProfile(**topic.qos()))
 
     def build(self) -> None:
-        """Build a reconstructor for every prior; from then on they can be asked for.
+        """Build a reconstructor for every prior; from then on they can be asked for, and learning begins.
 
         Raises:
-            InstrumentError: the instrument or a prior's name is wrong.
+            InstrumentError: the instrument, or a parameter, is wrong.
         """
-        value = self.get_parameter("system").value
-        if not value:
+        values = {name: self.get_parameter(name).value for name, _, _ in parameters()}
+        if not values["system"]:
             raise InstrumentError("parameter system: expected a name or the path of a .yaml file")
-        system = load_system(value, json.loads(self.get_parameter("changes").value))
-        for prior in self.get_parameter("priors").value:
+        if values["method"] not in METHODS:
+            raise InstrumentError(f"parameter method: expected one of {', '.join(METHODS)}, got {values['method']!r}")
+        for name, least in _LEAST.items():
+            if not values[name] >= least:
+                raise InstrumentError(f"parameter {name}: expected at least {least:g}, got {values[name]:g}")
+        system = load_system(values["system"], json.loads(values["changes"]))
+        method = METHODS[values["method"]]
+        G = None
+        for prior in values["priors"]:
             if prior not in PRIORS:
                 raise InstrumentError(f"parameter priors: expected some of {', '.join(PRIORS)}, got {prior!r}")
             believed = PRIORS[prior](system)
-            reconstructor, _ = implicit(believed, label=prior)
-            self._built[prior] = (believed, reconstructor)
+            reconstructor, G = method(believed, label=prior)
+            self._built[prior] = Belief(prior, believed, reconstructor)
             self.get_logger().info(f"built {prior}: {reconstructor.id:016x}")
+        if values["learn"]:
+            if values["interaction_matrix"]:
+                try:
+                    G = load_interaction_matrix(values["interaction_matrix"], Layout(system).fingerprint)
+                except ReconstructorError as error:
+                    raise InstrumentError(f"parameter interaction_matrix: {error}") from None
+            if G is None:
+                raise InstrumentError("parameter priors: expected at least one to begin learning with")
+            self._begin_learning(system, G, values)
         self.create_service(PublishReconstructor, "srtc/publish", self._publish)
+
+    # -- publishing -------------------------------------------------------------------------------------------------
 
     def _publish(
         self, request: PublishReconstructor.Request, response: PublishReconstructor.Response
     ) -> PublishReconstructor.Response:
         found = [
-            (label, believed, reconstructor)
-            for label, (believed, reconstructor) in self._built.items()
-            if request.label == label or (not request.label and request.id == reconstructor.id)
+            belief
+            for label, belief in self._built.items()
+            if request.label == label or (not request.label and request.id == belief.reconstructor.id)
         ]
         if not found:
             wanted = request.label or f"{request.id:016x}"
             response.message = f"no reconstructor {wanted!r} here, only {', '.join(self._built) or 'none yet'}"
             return response
-        label, believed, reconstructor = found[0]
+        belief = found[0]
         if request.blocks:
-            self._send_blocks(reconstructor, set(request.blocks))
+            self._send_blocks(belief.reconstructor, set(request.blocks))
         else:
-            self._send_profile(label, believed, reconstructor)
-            self._send_manifest(reconstructor)
-            self._send_blocks(reconstructor, None)
+            if belief.source != _LEARNED:
+                self._send_profile(belief.source, belief.reconstructor.id, believed_fields(belief.system))
+            self._send(belief.reconstructor)
         response.success = True
-        response.message = label
-        response.id = reconstructor.id
-        response.sha256 = list(reconstructor.sha256)
+        response.message = belief.source
+        response.id = belief.reconstructor.id
+        response.sha256 = list(belief.reconstructor.sha256)
         return response
 
-    def _send_manifest(self, reconstructor: Reconstructor) -> None:
+    def _send(self, reconstructor: Reconstructor) -> None:
         message = ReconstructorMsg(
             id=reconstructor.id,
             sha256=list(reconstructor.sha256),
@@ -131,6 +201,7 @@ class SrtcNode(Node):
         )
         message.header.stamp = self.get_clock().now().to_msg()
         self._manifests.publish(message)
+        self._send_blocks(reconstructor, None)
 
     def _send_blocks(self, reconstructor: Reconstructor, only: Iterable[int] | None) -> None:
         for block in reconstructor.blocks():
@@ -144,20 +215,145 @@ class SrtcNode(Node):
                     )
                 )  # fmt: skip
 
-    def _send_profile(self, source: str, believed: System, reconstructor: Reconstructor) -> None:
-        atmosphere = believed.atmosphere
-        message = AtmosphereProfile(
-            reconstructor=reconstructor.id,
-            source=source,
-            r0=atmosphere.r0,
-            outer_scale=atmosphere.outer_scale,
-            altitude=[layer.altitude for layer in atmosphere.layers],
-            fraction=list(atmosphere.fractions),
-            wind_speed=[layer.wind_speed for layer in atmosphere.layers],
-            wind_direction=[layer.wind_direction for layer in atmosphere.layers],
-        )
+    def _send_profile(self, source: str, identity: int, fields: dict[str, Any]) -> None:
+        message = AtmosphereProfile(reconstructor=identity, source=source, **fields)
         message.header.stamp = self.get_clock().now().to_msg()
         self._profiles.publish(message)
+
+    # -- learning ---------------------------------------------------------------------------------------------------
+
+    def _begin_learning(self, system: System, G: Any, values: dict[str, Any]) -> None:
+        method, predicts = METHODS[values["method"]], values["method"] == "predictive"
+        rules = Rules(
+            floor=values["floor"] * 1e-9, every=values["every"], watch=2 * values["window"], pause=values["pause"]
+        )
+        every = max(1, round(system.loop.rate / COUNTED_RATE))
+        telemetry = Telemetry(
+            system, G, window=values["window"], every=every, lags=lags_of(system, every) if predicts else ()
+        )
+        frames_ahead = effective_lag(system.loop) * system.loop.rate
+        learner = Learner(
+            system,
+            partial(learned_sky, system, winds=predicts),
+            lambda believed: method(believed, label=_LEARNED, fast=True)[0],
+            rules,
+            ahead=every * max(1, round(frames_ahead / every)) if predicts else 0,
+        )
+        for belief in self._built.values():
+            learner.know(belief)
+        self._system = system
+        self._auto_commit, self._window = values["auto_commit"], values["window"]
+        self._status: HrtcStatus | None = None
+        self._order: _Order | None = None
+        self._judging = False
+        self._last_asked = time.monotonic()
+        self._reason = 0, "waiting for telemetry"
+        self._hot_node = Node("srtc_hot")
+        self._listener = Listener(self._hot_node, telemetry, system.loop.rate, len(system.sensors))
+        self._worker = Worker(learner)
+        self._listener.start()
+        self._worker.start()
+        self.create_subscription(HrtcStatus, wire.STATUS.name, self._on_status, QoSProfile(**wire.STATUS.qos()))
+        self._commit = self.create_client(SwapReconstructor, "hrtc/commit")
+        self._roll_back = self.create_client(SwapReconstructor, "hrtc/roll_back")
+        self.create_timer(0.1, partial(self._follow, self._listener, self._worker))
+        self.create_timer(1.0, partial(self._diagnose, self._listener))
+
+    def _on_status(self, status: HrtcStatus) -> None:
+        if self._worker is not None and (self._status is None or status.reconstructor != self._status.reconstructor):
+            self._worker.running(status.reconstructor)
+        self._status = status
+        self._pursue()
+
+    def _follow(self, listener: Listener, worker: Worker) -> None:
+        """Hand windows to the worker, and act on what it makes of them."""
+        now = time.monotonic()
+        if not self._judging and now - self._last_asked >= self._window:
+            self._last_asked, self._judging = now, True
+            listener.ask()
+        if not listener.windows.empty():
+            window = listener.windows.get()
+            if isinstance(window, Statistics):
+                worker.judge(window)
+            else:
+                self._judging = False
+                self._told(1, window)
+        if not worker.judgements.empty():
+            self._judging = False
+            self._act_on(worker.judgements.get())
+
+    def _act_on(self, judgement: Judgement) -> None:
+        candidate = judgement.candidate
+        if judgement.sky is not None:
+            identity = candidate.reconstructor.id if candidate is not None else 0
+            self._send_profile(_LEARNED, identity, learned_fields(self._system, judgement.sky, judgement.window))
+        message = ModelHealth(**health_fields(judgement))
+        message.header.stamp = self.get_clock().now().to_msg()
+        self._healths.publish(message)
+        self._told(*diagnosis(judgement))
+        if judgement.outcome is Outcome.PUBLISHED and candidate is not None:
+            self._built[_LEARNED] = candidate
+            self._send(candidate.reconstructor)
+            self._give_order(_Order(candidate.reconstructor, False, time.monotonic() + _STAGING))
+        elif judgement.outcome is Outcome.ROLLED_BACK and judgement.previous is not None:
+            self._give_order(_Order(judgement.previous.reconstructor, True, time.monotonic() + _STAGING))
+
+    def _told(self, level: int, reason: str) -> None:
+        """Say it from now on in the diagnostics, and once in the log; ``level``: 0 OK, 1 WARN, 2 ERROR."""
+        news = (level, reason) != self._reason
+        self._reason = level, reason
+        # rclpy wants one line of code for each severity
+        if news and level:
+            self.get_logger().warning(reason)
+        elif news:
+            self.get_logger().info(reason)
+
+    def _give_order(self, order: _Order) -> None:
+        if self._auto_commit:
+            self._order = order
+        else:
+            self.get_logger().info(f"auto_commit is off: to {order.text} is the operator's")
+
+    def _pursue(self) -> None:
+        """Swap as soon as the HRTC can."""
+        order, status = self._order, self._status
+        if order is None or status is None or order.called:
+            return
+        identity = order.reconstructor.id
+        if status.reconstructor == identity:
+            self._order = None
+        elif identity == (status.previous if order.roll_back else status.staged):
+            order.called = True
+            client = self._roll_back if order.roll_back else self._commit
+            request = SwapReconstructor.Request(id=identity, sha256=list(order.reconstructor.sha256))
+            client.call_async(request).add_done_callback(partial(self._swapped, order))
+        elif time.monotonic() > order.until:
+            self._order = None
+            self._told(2, f"could not {order.text}: the HRTC does not hold it")
+
+    def _swapped(self, order: _Order, future: Future) -> None:
+        self._order = None
+        response = future.result()
+        if response is not None and response.success:
+            self.get_logger().info(f"{order.text}: from frame {response.first_frame} on")
+        else:
+            self._told(2, f"could not {order.text}: {response and response.message}")
+
+    def _diagnose(self, listener: Listener) -> None:
+        level, reason = self._reason
+        status = DiagnosticStatus(name="srtc", hardware_id=self.get_namespace(), level=bytes([level]), message=reason)
+        status.values = [KeyValue(key=f"frames {name}", value=str(count)) for name, count in listener.counts.items()]
+        message = DiagnosticArray(status=[status])
+        message.header.stamp = self.get_clock().now().to_msg()
+        self._diagnostics.publish(message)
+
+    def close(self) -> None:
+        """End the threads and give the endpoints back."""
+        if self._worker is not None and self._listener is not None:
+            self._worker.finish()
+            self._listener.finish()
+            self._hot_node.destroy_node()
+        self.destroy_node()
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -181,12 +377,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         node.build()
         while not stop.is_set():
             executor.spin_once(timeout_sec=0.1)
-    except InstrumentError as error:
+    except (InstrumentError, ValueError) as error:
         node.get_logger().error(str(error))
         return 2
     finally:
         executor.shutdown()
-        node.destroy_node()
+        node.close()
         rclpy.shutdown()
     return 0
 

@@ -72,7 +72,8 @@ class HeldOut:
         measured: (n_held, n_slopes) slopes as measured, without blind modes, P y, rad.
         frames: (n_held,) exposure numbers.
         block: (n_held,) index of the run that each belongs to, ascending from 0: what a jackknife leaves out.
-        reconstructor: (n_held,) id of the reconstructor that answered the exposure; 0 when none was active.
+        reconstructor: (n_held,) id of the reconstructor that answered the exposure; 0 when none was active, or the loop
+            open.
     """
 
     slopes: NDArray[np.float32]
@@ -323,7 +324,7 @@ class Telemetry:
             measured[i], mirror[i] = exposure.slopes, exposure.mirror
         slopes = self._seen(measured + mirror @ self._G_transposed)
         frames = [exposure.frame for exposure in batch]
-        reconstructor = np.array([exposure.reconstructor for exposure in batch], np.uint64)
+        reconstructor = np.array([exposure.reconstructor if exposure.closed else 0 for exposure in batch], np.uint64)
         known = self._tail_frames + frames
         rows = np.concatenate([self._tail, slopes]) if self._lags else slopes
         row_of = {frame: i for i, frame in enumerate(known)}

@@ -24,6 +24,7 @@ MAY_IMPORT_ROS = (
     "srtomo_rtc/recorder_node.py",
     "srtomo_sim/node.py",
     "srtomo_srtc/node.py",
+    "srtomo_srtc/listener.py",  # the node's hot endpoints
     "srtomo_ops/operator.py",  # calls the nodes
     "srtomo_ops/publish.py",
     "srtomo_ops/demo.py",

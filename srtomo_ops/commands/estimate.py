@@ -1,0 +1,139 @@
+"""``srtomo estimate``."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from srtomo_core.bag import BagError, BagReader
+from srtomo_core.layout import Layout
+from srtomo_core.reconstructor import load_interaction_matrix
+from srtomo_core.system import System
+from srtomo_ops.options import writable_file, write_json
+from srtomo_srtc.learn import LIMIT, Learned, learn
+from srtomo_srtc.mirrors import interaction_matrix
+from srtomo_srtc.telemetry import Statistics, Telemetry
+
+EXAMPLE = """examples:
+  srtomo estimate night1 --plot night1.png
+  srtomo estimate night1 --altitudes 0,4000,8000,16000 -o sky.json"""
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Arguments of the command."""
+    parser.add_argument("bag", metavar="BAG", type=Path, help="directory or .mcap file")
+    parser.add_argument(
+        "--altitudes",
+        metavar="M,M,...",
+        type=_altitudes,
+        help="of the layers, m above the telescope, ascending (default: what the stars can tell apart)",
+    )
+    parser.add_argument(
+        "--interaction-matrix",
+        metavar="FILE",
+        type=Path,
+        help="the one that the loop ran with, made by 'srtomo calibrate' (default: computed)",
+    )
+    parser.add_argument(
+        "--slopes", metavar="N", type=int, default=LIMIT, help=f"to work with, at most about (default: {LIMIT})"
+    )
+    parser.add_argument("-o", "--output", metavar="FILE", type=Path, help="write what was learned to FILE as JSON")
+    parser.add_argument("--plot", metavar="FILE", type=Path, help="draw profile and covariances to FILE")
+
+
+def _altitudes(text: str) -> list[float]:
+    return [float(value) for value in text.split(",")]
+
+
+def main(options: argparse.Namespace) -> int:
+    """Run the command."""
+    for path in (options.output, options.plot):
+        if path is not None:
+            writable_file(path)
+    with BagReader(options.bag) as reader:
+        if reader.cut:
+            print(reader.cut)
+        text = reader.metadata.get("system")
+        if text is None:
+            raise BagError(f"{options.bag}: does not say which instrument it is of: not recorded by 'srtomo record'?")
+        system = System.model_validate_json(text)
+        statistics = _statistics(reader, system, options.interaction_matrix)
+    start = time.perf_counter()
+    learned = learn(system, statistics, altitudes=options.altitudes, limit=options.slopes)
+    seconds = time.perf_counter() - start
+    _print(system, statistics, learned)
+    if options.plot is not None:
+        from srtomo_ops.report import sky_figure
+
+        sky_figure(options.plot, system, learned)
+    write_json(options.output, {**_numbers(system, statistics, learned), "seconds": seconds})
+    return 0
+
+
+def _statistics(reader: BagReader, system: System, matrix: Path | None) -> Statistics:
+    layout = Layout(system)
+    G: NDArray[np.floating] = (
+        interaction_matrix(system, layout) if matrix is None else load_interaction_matrix(matrix, layout.fingerprint)
+    )
+    first, last = reader.time_range
+    # one block, longer than the bag: nothing is forgotten or held out
+    telemetry = Telemetry(system, G, window=(last - first) * 1e-9 + 1, blocks=1, held_out=0)
+    telemetry.feed(reader)
+    return telemetry.statistics()
+
+
+def _print(system: System, statistics: Statistics, learned: Learned) -> None:
+    low, high = learned.outer_scale_range
+    seen = f"{low:.0f} to {high:.0f} m" if math.isfinite(high) else f"above {low:.0f} m"
+    print(
+        f"{system.name}: {learned.n_frames} frames over {statistics.duration:.1f} s, worth {learned.n_effective:.0f} "
+        f"independent ones\n"
+        f"  r0           {100 * learned.r0:.2f} +- {100 * learned.r0_sigma:.2f} cm at 500 nm and zenith\n"
+        f"  outer scale  {learned.outer_scale:.0f} m ({seen})\n"
+        f"  {'altitude [m]':<18} {'share of Cn2':>14}"
+    )
+    for group in reversed(learned.groups):
+        ends = [f"{learned.altitudes[i]:.0f}" for i in (group.layers[0], group.layers[-1])]
+        where = ends[0] if len(group.layers) == 1 else f"{ends[0]} to {ends[1]}"
+        why = f"   {len(group.layers)} layers told as one: {group.reason}" if group.reason else ""
+        print(f"  {where:<18} {group.fraction:6.3f} +- {group.sigma:.3f}{why}")
+    print("  noise variance over that of the instrument file")
+    for level in learned.noise:
+        print(f"  {system.sensors[level.sensor].name:<18} {level.factor:6.3f} +- {level.sigma:.3f}")
+
+
+def _numbers(system: System, statistics: Statistics, learned: Learned) -> dict[str, Any]:
+    low, high = learned.outer_scale_range
+    return {
+        "system": system.name,
+        "frames": learned.n_frames,
+        "duration_s": statistics.duration,
+        "independent_frames": learned.n_effective,
+        "r0_m": learned.r0,
+        "r0_sigma_m": learned.r0_sigma,
+        "outer_scale_m": learned.outer_scale,
+        "outer_scale_low_m": low,
+        "outer_scale_high_m": high if math.isfinite(high) else None,
+        "altitudes_m": learned.altitudes.tolist(),
+        "fractions": learned.fractions.tolist(),
+        "groups": [
+            {
+                "altitudes_m": [float(learned.altitudes[i]) for i in group.layers],
+                "altitude_m": group.altitude,
+                "fraction": group.fraction,
+                "sigma": group.sigma,
+                "reason": group.reason,
+            }
+            for group in learned.groups
+        ],
+        "noise": [
+            {"sensor": system.sensors[level.sensor].name, "variance_factor": level.factor, "sigma": level.sigma}
+            for level in learned.noise
+        ],
+    }

@@ -1,0 +1,77 @@
+"""How many independent frames a stretch of moving sky is worth, for one parameter or another.
+
+What an estimate takes from a frame is a quadratic form ``s^T M s``. In frozen flow two such forms, of frames a time t
+apart, have the covariance ``2 tr(M C_t M C_t^T)``, C_t that of slopes with those t earlier: a wind that has carried
+the sky across a sub-aperture has renewed what small scales tell, for large ones it has to cross the pupil.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from srtomo_srtc.sky_model import SkyModel
+
+Array = NDArray[np.float64]
+
+_PROBES = 64  # random vectors that stand for a trace
+_FIRST = 0.2  # of the time in which the fastest layer crosses a sub-aperture: the first time that is looked at
+_FARTHEST = 500.0  # m that the fastest layer goes: beyond, nothing resembles what was
+_RATIO = 2.2  # of such times
+_NEGLIGIBLE = 0.002  # correlation
+_SLOWEST = 1e-3  # m/s
+
+
+def independent_frames(
+    model: SkyModel,
+    strengths: Array,
+    outer_scale: float,
+    inverse: NDArray[np.floating],
+    influences: Sequence[NDArray[np.floating]],
+    velocity: Array,
+    size: float,
+    interval: float,
+    n_frames: int,
+) -> Array:
+    """Number of independent frames with the variance of ``n_frames`` in sequence, (n_influences,).
+
+    Args:
+        model: of the turbulence; a coarse one will do.
+        inverse: (n, n) C^-1 of the slopes with their noise.
+        influences: of each parameter, ``sum_i w_i B_i`` (n, n), of which C^-1 on both sides makes M.
+        velocity: (n_layers, 2) m/s, where each layer goes.
+        size: of a sub-aperture, m.
+        interval: between frames, s; infinite where frames are independent.
+    """
+    if not math.isfinite(interval) or n_frames < 2:
+        return np.full(len(influences), float(n_frames))
+    speed = max(_SLOWEST, float(np.hypot(*velocity[strengths > 0].T).max(initial=0.0)))
+    end = min(interval * n_frames, _FARTHEST / speed)
+    draw = np.random.default_rng(0)
+    Z = draw.choice(np.array([-1, 1], np.float32), (len(inverse), _PROBES))
+    A = np.asarray(inverse, np.float32)
+
+    def through(vectors: NDArray[np.float32]) -> list[NDArray[np.float32]]:
+        """Each parameter's M, times vectors (n, n_vectors)."""
+        seen = A @ vectors
+        return [A @ (influence @ seen) for influence in influences]
+
+    first = through(Z)
+
+    def correlated(C: NDArray[np.float32]) -> Array:
+        return np.array([np.vdot(C.T @ a, b) for a, b in zip(first, through(C.T @ Z))], np.float64)
+
+    alone = correlated(np.asarray(np.linalg.inv(inverse), np.float32))
+    times, correlations = [0.0], [correlated(model.lagged(strengths, outer_scale, velocity, 0.0)) / alone]
+    while times[-1] < end and correlations[-1].max() > _NEGLIGIBLE:
+        times.append(_RATIO * times[-1] or _FIRST * size / speed)
+        correlations.append(correlated(model.lagged(strengths, outer_scale, velocity, times[-1])) / alone)
+    times.append(_RATIO * times[-1])
+    correlations.append(np.zeros(len(influences)))
+    k = np.arange(1, n_frames)
+    weights = 2 * (1 - k / n_frames)
+    sums = [weights @ np.interp(k * interval, times, correlation) for correlation in np.transpose(correlations)]
+    return n_frames / (1 + np.maximum(sums, 0))

@@ -1,0 +1,470 @@
+"""The sky from telemetry: r0, outer scale, layer strengths and noise levels, by maximum likelihood.
+
+The theoretical covariance of the slopes, ``C(theta) = sum_l c_l B_l(L0) + sum_w n_w N_w``, is matched to the measured
+one of pseudo-open-loop slopes, whitened by itself and iterated (:mod:`srtomo_srtc.likelihood`). Strengths and noise
+levels are not negative. Frames of a moving sky resemble each other: how many independent ones they are worth follows,
+for each parameter, from frozen flow.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import brentq
+
+from srtomo_core.layout import Layout, SensorLayout
+from srtomo_core.system import Atmosphere, Layer, Sensor, System
+from srtomo_srtc.frozen_flow import independent_frames
+from srtomo_srtc.likelihood import information, inverse_of, non_negative_step, score
+from srtomo_srtc.model import layout_of
+from srtomo_srtc.noise import slope_noise
+from srtomo_srtc.sampling import Sampling
+from srtomo_srtc.sky_model import SkyModel
+from srtomo_srtc.telemetry import Statistics
+
+Array = NDArray[np.float64]
+
+LIMIT = 1300
+"""Default number of slopes that the fit works with, at most about: its cost grows with the cube."""
+
+CORRELATED = 0.85
+"""Strengths of neighbouring layers (or groups of such) that correlate by less than minus this are told as one."""
+
+TOP = 18e3
+"""Highest altitude of the default grid, m above the telescope."""
+
+_LAYERS = 10  # of the default grid, at most
+_R0 = 0.01, 2.0  # m along the line of sight: what is outside is no sky
+_OUTER_SCALES = 3.0, 300.0  # m
+_POWER = 1.5  # the outer scale enters as L0^-1.5, in which the slopes' covariance is nearly linear
+_CONVERGED = 1e-6  # squared step over the squared error from one frame
+_NEAR = 1e-2  # likewise: closer, the information is that of the solution
+_ITERATIONS = 20
+_RELINEARISE = 0.15  # change of log L0 that the derivative is not trusted with
+_STRIDE = 1.0  # of log L0 in an iteration, at most
+_EVERYWHERE = 0.1  # of the turbulence to start from: a layer without any is slow to gain some
+_FEWEST = 50  # frames
+_RIDGE = 1e-7  # of the information, where layers are all but the same
+
+
+class LearnError(ValueError):
+    """No sky can be told from these frames; one line that says why."""
+
+
+@dataclass(frozen=True)
+class Group:
+    """Layers that are told as one.
+
+    Attributes:
+        layers: indices, neighbours on the grid.
+        altitude: of the group: mean of its layers' by strength, m above the telescope.
+        fraction: of the integrated Cn2.
+        sigma: of ``fraction``.
+        n_effective: number of independent frames that its error stands for.
+        reason: why its layers are one; empty for a single layer.
+    """
+
+    layers: tuple[int, ...]
+    altitude: float
+    fraction: float
+    sigma: float
+    n_effective: float
+    reason: str
+
+
+@dataclass(frozen=True)
+class NoiseLevel:
+    """Of one sensor: the variance of its slopes' noise over what the instrument's file says.
+
+    Attributes:
+        sensor: index.
+        factor: 1 where the file is right.
+        sigma: of ``factor``.
+    """
+
+    sensor: int
+    factor: float
+    sigma: float
+
+
+@dataclass(frozen=True, eq=False)
+class Learned:
+    """What telemetry tells of the sky. 1-sigma errors everywhere.
+
+    Attributes:
+        r0: Fried parameter at 500 nm and zenith, m.
+        r0_sigma: m.
+        outer_scale: m.
+        outer_scale_range: 1-sigma interval, m; the upper end is infinite where the outer scale is too large to be seen.
+        altitudes: (n_layers,) the grid, m above the telescope.
+        fractions: (n_layers,) best fit; of layers that are merged only the sum means anything.
+        groups: layers that can be told apart, lowest first.
+        noise: of each sensor that takes part.
+        n_frames: frames used.
+        n_effective: independent ones that r0's error stands for.
+        iterations: that the fit took.
+        measured, fitted: (n, n) covariances of the slopes that the fit worked with, rad^2.
+        sampling: which these are.
+    """
+
+    r0: float
+    r0_sigma: float
+    outer_scale: float
+    outer_scale_range: tuple[float, float]
+    altitudes: Array
+    fractions: Array
+    groups: tuple[Group, ...]
+    noise: tuple[NoiseLevel, ...]
+    n_frames: int
+    n_effective: float
+    iterations: int
+    measured: NDArray[np.float32]
+    fitted: NDArray[np.float32]
+    sampling: Sampling
+
+    def system(self, system: System, velocity: Array | None = None) -> System:
+        """The instrument with this sky and noise in it. Sensors with a measured noise covariance keep it.
+
+        Args:
+            system: whose telemetry was learned from.
+            velocity: (n_layers, 2) of the layers, where they go, m/s; by default that of the system's own sky.
+        """
+        flow = winds_at(system, self.altitudes) if velocity is None else velocity
+        layers = [
+            Layer(
+                altitude=float(altitude),
+                fraction=float(fraction),
+                wind_speed=math.hypot(*wind),
+                wind_direction=math.atan2(wind[1], wind[0]),
+            )
+            for altitude, fraction, wind in zip(self.altitudes, self.fractions, flow, strict=True)
+            if fraction > 0
+        ]
+        sky = Atmosphere(r0=self.r0, outer_scale=self.outer_scale, layers=tuple(layers))
+        changes: dict[str, object] = {"atmosphere": sky.model_dump()}
+        layout = Layout(system)
+        for level in self.noise:
+            sensor = system.sensors[level.sensor]
+            if sensor.noise_covariance is None:
+                photons = photons_for(system, sensor, layout.sensors[level.sensor], level.factor)
+                changes[f"sensors.{level.sensor}.photons"] = photons
+        return system.with_changes(changes)
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """Where the likelihood is largest.
+
+    Attributes:
+        strengths: (n_layers,) along the line of sight, m^(-5/3).
+        outer_scale: m.
+        levels: (n_sensors,) noise variances over nominal ones.
+        information: (n_layers + 1 + n_sensors,) squared: Fisher information of a frame about the strengths, L0^-1.5 and
+            the levels, in this order.
+        bases: (n, n) of each of these parameters: the covariance's derivative.
+        covariance: (n, n) of the slopes, rad^2.
+        iterations: that it took.
+    """
+
+    strengths: Array
+    outer_scale: float
+    levels: Array
+    information: Array
+    bases: Sequence[NDArray[np.float32]]
+    covariance: Array
+    iterations: int
+
+
+def fit(model: SkyModel, S: NDArray[np.floating], strengths: Array, outer_scale: float) -> Fit:
+    """Find the sky under which slopes with the second moment ``S`` are most likely, by Fisher scoring.
+
+    Args:
+        S: (n, n) as :meth:`SkyModel.measured` gives it, rad^2.
+        strengths: (n_layers,) to start from; their sum is not used.
+        outer_scale: to start from, m.
+
+    Raises:
+        LearnError: the fit does not converge, or ends where no sky is.
+    """
+    n_layers = len(strengths)
+    noise = np.array([n.trace() for n in model.noise])
+    shape = np.asarray(strengths, np.float64) / np.sum(strengths)
+    per_strength = float(model.turbulence(shape, outer_scale).trace())
+    scale = max(float(S.trace()) - noise.sum(), 0.1 * float(S.trace())) / per_strength
+    theta = np.concatenate([scale * shape, [outer_scale**-_POWER], np.ones(len(noise))])
+    unseen = model.unseen(float(S.trace()) / len(S)).astype(np.float64)
+    far, at = True, math.nan  # outer scale that the bases belong to
+    layers: list[NDArray[np.float32]] = []
+    for iteration in range(1, _ITERATIONS + 1):
+        c, outer_scale, levels = theta[:n_layers], theta[n_layers] ** (-1 / _POWER), theta[n_layers + 1 :]
+        moved = not abs(math.log(outer_scale / at)) < _RELINEARISE
+        if moved:
+            at = outer_scale
+            layers = [model.layer(l, at) for l in range(n_layers)]
+        if moved or far:
+            slope = model.by_log_outer_scale(c, at) / np.float32(-_POWER * at**-_POWER)
+        C = unseen + _total(layers, c) + _total(model.noise, levels)
+        C += (theta[n_layers] - at**-_POWER) * slope
+        bases = [*layers, slope, *model.noise]
+        try:
+            inverse = inverse_of(C).astype(np.float32)
+            if far:
+                F = information(inverse, bases)
+                F[np.diag_indices_from(F)] *= 1 + _RIDGE
+            g = score(inverse, (S + unseen - C).astype(np.float32), bases)
+            if not (np.isfinite(F).all() and np.isfinite(g).all() and np.all(np.diag(F) > 0)):
+                raise LearnError("no sky fits: the likelihood is not finite")
+            best = _within(theta, non_negative_step(theta, g, F), n_layers)
+        except (np.linalg.LinAlgError, RuntimeError):
+            raise LearnError("no sky fits: the covariance cannot be inverted") from None
+        step = best - theta
+        size = float(step @ F @ step)
+        if size < _CONVERGED:
+            _sensible(c, outer_scale)
+            return Fit(c, outer_scale, levels, F, bases, C, iteration)
+        far, theta = size > _NEAR, best
+    raise LearnError(f"no sky fits: not converged after {_ITERATIONS} iterations")
+
+
+def _sensible(strengths: Array, outer_scale: float) -> None:
+    r0 = max(float(strengths.sum()), 1e-30) ** -0.6
+    if not _R0[0] < r0 < _R0[1]:
+        raise LearnError(f"no sky fits: an r0 of {r0:.3g} m")
+    if outer_scale < 1.01 * _OUTER_SCALES[0]:
+        raise LearnError(f"no sky fits: an outer scale below {_OUTER_SCALES[0]:g} m")
+
+
+def _total(bases: Sequence[NDArray[np.float32]], factors: Array) -> Array:
+    out = np.zeros(bases[0].shape)
+    for basis, factor in zip(bases, factors, strict=True):
+        if factor:
+            out += np.float32(factor) * basis
+    return out
+
+
+def _within(theta: Array, aim: Array, n_layers: int) -> Array:
+    """``aim``, less far from ``theta`` in outer scale than it may be, and with some noise left."""
+    out = aim.copy()
+    far = math.exp(_POWER * _STRIDE)
+    low, high = sorted(scale**-_POWER for scale in _OUTER_SCALES)
+    out[n_layers] = np.clip(aim[n_layers], max(theta[n_layers] / far, low), min(theta[n_layers] * far, high))
+    out[n_layers + 1 :] = np.maximum(aim[n_layers + 1 :], 0.1 * theta[n_layers + 1 :])
+    return out
+
+
+def learn(
+    system: System,
+    statistics: Statistics,
+    *,
+    layout: Layout | None = None,
+    altitudes: Sequence[float] | None = None,
+    velocity: Array | None = None,
+    limit: int = LIMIT,
+) -> Learned:
+    """Estimate the sky.
+
+    The second moment about zero is fitted: what a window's mean holds is turbulence for the most part, and taking it
+    out would make short windows' turbulence too weak. Static aberrations belong into the slope reference.
+
+    Args:
+        system: the instrument; its sky and photons are where the fit starts from, no more.
+        statistics: of pseudo-open-loop slopes without blind modes.
+        layout: where sensors are taken to be; as in the system when not given.
+        altitudes: of the layers to tell the turbulence from, m above the telescope, ascending; by default
+            :func:`default_altitudes`.
+        velocity: (n_layers, 2) of these layers, where they go, m/s; by default that of the system's sky. It decides how
+            many independent frames there were, and so the errors, not the estimates.
+        limit: number of slopes to work with, at most about.
+
+    Raises:
+        LearnError: there are too few frames, or none that are finite; the fit does not converge, or ends where no sky
+            is. Nothing is learned then.
+        ValueError: the statistics or the layout are another instrument's; the altitudes are not ascending.
+    """
+    layout = layout_of(system, layout)
+    grid = default_altitudes(system, layout) if altitudes is None else np.asarray(altitudes, np.float64)
+    if grid.ndim != 1 or not len(grid) or grid[0] < 0 or not np.all(np.diff(grid) > 0):
+        raise ValueError("altitudes: expected ascending metres above the telescope")
+    flow = winds_at(system, grid) if velocity is None else np.asarray(velocity, np.float64)
+    if flow.shape != (len(grid), 2):
+        raise ValueError(f"velocity: expected shape {(len(grid), 2)}, got {flow.shape}")
+    _check(statistics, layout)
+    sampling = Sampling.of(system, layout, limit)
+    model = SkyModel(system, layout, sampling, grid * system.airmass)
+    S = model.measured(statistics.covariance, statistics.mean)
+    if not np.isfinite(S).all():
+        raise LearnError("the covariance is not finite")
+    if not S.trace() > 0:
+        raise LearnError("the slopes do not move")
+    found = fit(model, S, strengths_at(system, grid), system.atmosphere.outer_scale)
+    return _told(system, layout, model, found, S, statistics, grid, flow, limit)
+
+
+def photons_for(system: System, sensor: Sensor, place: SensorLayout, factor: float) -> float:
+    """Photons (e/m^2/s) with which the noise variance of a sensor is ``factor`` times what it is now."""
+
+    def variance(brighter: float) -> float:
+        changed = sensor.model_copy(update={"photons": sensor.photons * brighter})
+        return float(slope_noise(system, changed, place).variance.sum())
+
+    # between photons alone (1/N) and read-out alone (1/N^2)
+    wanted = factor * variance(1.0)
+    ends = sorted((1 / factor, factor**-0.5))
+    return sensor.photons * brentq(lambda x: variance(x) / wanted - 1, 0.9 * ends[0], 1.1 * ends[1])
+
+
+def default_altitudes(system: System, layout: Layout) -> Array:
+    """Ground, and up to :data:`TOP` in steps of half of what shifts the farthest stars' beams by a sub-aperture.
+
+    Returns:
+        (n_layers,) m above the telescope; no more than ten.
+    """
+    apart, top = 0.0, TOP
+    for a in system.guide_stars:
+        for b in system.guide_stars:
+            apart = max(apart, math.hypot(a.position.x - b.position.x, a.position.y - b.position.y))
+        if a.altitude is not None:
+            top = min(top, 0.9 * a.altitude)
+    if apart == 0:
+        return np.zeros(1)
+    size = min(place.size for place in layout.sensors)
+    step = max(size / apart / system.airmass / 2, top / (_LAYERS - 1))
+    return np.arange(0.0, top + 1e-6 * step, step)
+
+
+def strengths_at(system: System, altitudes: Array) -> Array:
+    """The system's profile on a grid, each layer shared by its two neighbours; a little everywhere. Sums to 1."""
+    shares = np.zeros(len(altitudes))
+    for layer, fraction in zip(system.atmosphere.layers, system.atmosphere.fractions, strict=True):
+        shares += fraction * np.array([np.interp(layer.altitude, altitudes, unit) for unit in np.eye(len(altitudes))])
+    return (1 - _EVERYWHERE) * shares / shares.sum() + _EVERYWHERE / len(altitudes)
+
+
+def winds_at(system: System, altitudes: Array) -> Array:
+    """(n_layers, 2) m/s, the system's wind at other altitudes, linear in between."""
+    layers = sorted(system.atmosphere.layers, key=lambda layer: layer.altitude)
+    at = [layer.altitude for layer in layers]
+    return np.stack(
+        [
+            np.interp(altitudes, at, [layer.wind_speed * turn(layer.wind_direction) for layer in layers])
+            for turn in (math.cos, math.sin)
+        ],
+        axis=1,
+    )
+
+
+def _check(statistics: Statistics, layout: Layout) -> None:
+    n = layout.n_slopes
+    if statistics.covariance.shape != (n, n):
+        raise ValueError(f"statistics: expected covariance of shape {(n, n)}, got {statistics.covariance.shape}")
+    if statistics.n_frames < _FEWEST:
+        raise LearnError(f"{statistics.n_frames} frames are too few: expected at least {_FEWEST}")
+
+
+def _told(
+    system: System,
+    layout: Layout,
+    model: SkyModel,
+    found: Fit,
+    S: NDArray[np.float32],
+    statistics: Statistics,
+    altitudes: Array,
+    velocity: Array,
+    limit: int,
+) -> Learned:
+    n_layers, n_sensors = len(altitudes), len(model.noise)
+    one_frame = np.asarray(np.linalg.inv(found.information), np.float64)
+    total = float(found.strengths.sum())
+    groups, reasons = _merge(one_frame[:n_layers, :n_layers])
+    fractions = np.array([found.strengths[list(group)].sum() / total for group in groups])
+
+    # what is told, each as a sum of the parameters: log r0, fractions, outer scale, noise levels
+    told = np.zeros((1 + len(groups) + 1 + n_sensors, n_layers + 1 + n_sensors))
+    told[0, :n_layers] = -0.6 / total
+    for row, group, fraction in zip(told[1:], groups, fractions):
+        row[list(group)] = 1 / total
+        row[:n_layers] -= fraction / total
+    told[1 + len(groups) :, n_layers:] = np.eye(1 + n_sensors)
+
+    n_effective = _independent(system, layout, model, found, told @ one_frame, velocity, statistics, limit)
+    sigma = np.sqrt(np.einsum("ij,jk,ik->i", told, one_frame, told) / n_effective)
+    scale, scale_sigma = found.outer_scale**-_POWER, float(sigma[1 + len(groups)])
+    large, small = scale - scale_sigma, scale + scale_sigma
+    altitude = [float(np.average(altitudes[list(g)], weights=found.strengths[list(g)] + 1e-9 * total)) for g in groups]
+    return Learned(
+        r0=total**-0.6 * math.cos(system.zenith_angle) ** -0.6,
+        r0_sigma=float(sigma[0]) * total**-0.6 * math.cos(system.zenith_angle) ** -0.6,
+        outer_scale=found.outer_scale,
+        outer_scale_range=(small ** (-1 / _POWER), large ** (-1 / _POWER) if large > 0 else math.inf),
+        altitudes=altitudes,
+        fractions=found.strengths / total,
+        groups=tuple(
+            Group(group, altitude[i], float(fractions[i]), float(sigma[1 + i]), float(n_effective[1 + i]), reasons[i])
+            for i, group in enumerate(groups)
+        ),
+        noise=tuple(
+            NoiseLevel(w, float(level), float(error))
+            for w, level, error in zip(model.noisy, found.levels, sigma[2 + len(groups) :])
+        ),
+        n_frames=statistics.n_frames,
+        n_effective=float(n_effective[0]),
+        iterations=found.iterations,
+        measured=S,
+        fitted=np.asarray(found.covariance - model.unseen(1.0) * (S.trace() / len(S)), np.float32),
+        sampling=model.sampling,
+    )
+
+
+def _independent(
+    system: System,
+    layout: Layout,
+    model: SkyModel,
+    found: Fit,
+    influences: Array,
+    velocity: Array,
+    statistics: Statistics,
+    limit: int,
+) -> Array:
+    """(n_told,) independent frames, from a coarse model: only ratios matter."""
+    coarse = SkyModel(system, layout, Sampling.of(system, layout, limit, 1), model.heights)
+    return independent_frames(
+        coarse,
+        found.strengths,
+        found.outer_scale,
+        inverse_of(found.covariance),
+        [_total(found.bases, row) for row in influences],
+        velocity,
+        min(part.place.size for part in model.sampling.parts),
+        statistics.duration / (statistics.n_frames - 1),
+        statistics.n_frames,
+    )
+
+
+def _merge(covariance: Array) -> tuple[list[tuple[int, ...]], list[str]]:
+    """Join neighbours, those that correlate most first, until none do by less than -:data:`CORRELATED`.
+
+    Args:
+        covariance: (n_layers, n_layers) of the strengths.
+    """
+    n_layers = len(covariance)
+    groups: list[tuple[int, ...]] = [(l,) for l in range(n_layers)]
+    worst: dict[tuple[int, ...], float] = {}
+    while len(groups) > 1:
+        sums = np.array([[l in group for l in range(n_layers)] for group in groups], np.float64)
+        together = sums @ covariance @ sums.T
+        size = np.sqrt(np.diag(together))
+        correlation = [together[i, i + 1] / (size[i] * size[i + 1]) for i in range(len(groups) - 1)]
+        i = int(np.argmin(correlation))
+        if correlation[i] > -CORRELATED:
+            break
+        merged = groups[i] + groups[i + 1]
+        worst[merged] = min(float(correlation[i]), worst.pop(groups[i], 0.0), worst.pop(groups[i + 1], 0.0))
+        groups[i : i + 2] = [merged]
+    return groups, [
+        f"their strengths correlate by {worst[group]:.2f}, limit -{CORRELATED:g}" if group in worst else ""
+        for group in groups
+    ]

@@ -1,0 +1,261 @@
+"""The wind of each layer, from pseudo-open-loop slopes at a time lag.
+
+Frozen flow says what slopes have in common with slopes a lag t earlier: ``<s[k] s[k-lag]^T> = sum_l c_l B_l(v_l t)``,
+with B_l(d) the covariance of layer l with itself displaced by d. The velocities that fit the measured matrices best
+are found in least squares, whitened by the slopes' own covariance: from the peak of the correlation with B_l(v t) over
+a grid of velocities, strongest layer first, each found one taken off; then all together by Gauss-Newton over all lags.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from srtomo_core.layout import Layout
+from srtomo_core.system import System
+from srtomo_srtc.atmosphere import Profile
+from srtomo_srtc.likelihood import inverse_of
+from srtomo_srtc.model import layout_of
+from srtomo_srtc.sampling import Sampling
+from srtomo_srtc.sky_model import SkyModel
+from srtomo_srtc.telemetry import Statistics
+
+Array = NDArray[np.float64]
+
+LIMIT = 360
+"""Default number of slopes that the fit works with, at most about."""
+
+UNSEEN = 3.0
+"""Error of a velocity's component, m/s, beyond which a layer's wind is said not to be seen."""
+
+_SPEEDS = np.arange(0.0, 31.0, 5.0)  # m/s, of the grid
+_DIRECTIONS = 12
+_STEP = 0.3  # m/s, of the central differences
+_ITERATIONS = 8
+_CLOSE = 0.02  # m/s: a step this small is the last
+_STRIDE = 4.0  # m/s: of an iteration, at most
+_FASTEST = 60.0  # m/s
+_LAGS = 100  # in counted frames, at most, over which frames that resemble each other are summed
+_FORGOTTEN = 1e-3  # of that sum: what comes after it is left out
+
+
+@dataclass(frozen=True)
+class LayerWind:
+    """One layer's wind.
+
+    Attributes:
+        altitude: m above the telescope.
+        fraction: of the integrated Cn2.
+        velocity: x, y, where the layer goes, m/s.
+        covariance: (2, 2) of it, m^2/s^2.
+        reason: why it is not to be trusted; empty when it is.
+    """
+
+    altitude: float
+    fraction: float
+    velocity: tuple[float, float]
+    covariance: Array
+    reason: str
+
+    @property
+    def speed(self) -> float:
+        """m/s."""
+        return math.hypot(*self.velocity)
+
+    @property
+    def direction(self) -> float:
+        """Where the layer goes, counter-clockwise from +x, rad."""
+        return math.atan2(self.velocity[1], self.velocity[0])
+
+    @property
+    def sigma(self) -> float:
+        """Larger 1-sigma error of the velocity's components, m/s."""
+        return math.sqrt(float(np.diag(self.covariance).max()))
+
+
+def learn_winds(
+    system: System, statistics: Statistics, layout: Layout | None = None, *, limit: int = LIMIT
+) -> tuple[LayerWind, ...]:
+    """The wind of each turbulent layer of a sky that is known but for its winds.
+
+    Layers that the sensors cannot separate should come merged into one: where two share what is measured, so do their
+    errors.
+
+    Args:
+        system: with the sky's r0, outer scale and layers as learned; its winds are not used.
+        statistics: with lagged moments; lags in which turbulence moves by half a sub-aperture to two are best.
+        limit: slopes to work with.
+
+    Returns:
+        One a turbulent layer, in the system's order.
+
+    Raises:
+        ValueError: there are no lagged moments, or no sensor with more than one sub-aperture.
+    """
+    layout = layout_of(system, layout)
+    if not statistics.lagged:
+        raise ValueError("wind: expected statistics with lagged moments")
+    profile = Profile.of(system)
+    model = SkyModel(system, layout, Sampling.of(system, layout, limit, oversampling=2), profile.heights)
+    per_frame = 1 / system.loop.rate
+    measured = {lag * per_frame: model.measured(matrix).astype(np.float64) for lag, matrix in statistics.lagged.items()}
+    pairs = min(statistics.lagged_frames.values())
+    flow = _Flow(model, profile, measured)
+    found = flow.refine(flow.search())
+    covariance = flow.covariance(found, pairs, statistics.interval)
+    layers = [
+        (layer.altitude, fraction)
+        for layer, fraction in zip(system.atmosphere.layers, system.atmosphere.fractions, strict=True)
+        if fraction > 0
+    ]
+    return tuple(
+        _wind(*layer, found[l], covariance[2 * l : 2 * l + 2, 2 * l : 2 * l + 2]) for l, layer in enumerate(layers)
+    )
+
+
+def with_winds(system: System, found: Sequence[LayerWind]) -> System:
+    """The system with the winds that were found; layers whose wind is not seen keep theirs.
+
+    Args:
+        found: one a turbulent layer, as :func:`learn_winds` has them for this system.
+    """
+    turbulent = [l for l, fraction in enumerate(system.atmosphere.fractions) if fraction > 0]
+    changes = {}
+    for l, wind in zip(turbulent, found, strict=True):
+        if not wind.reason:
+            changes[f"atmosphere.layers.{l}.wind_speed"] = wind.speed
+            changes[f"atmosphere.layers.{l}.wind_direction"] = wind.direction
+    return system.with_changes(changes)
+
+
+def _wind(altitude: float, fraction: float, velocity: Array, covariance: Array) -> LayerWind:
+    sigma = math.sqrt(float(np.diag(covariance).max()))
+    reason = ""
+    if not sigma < UNSEEN:
+        reason = f"too little of it is seen: {100 * fraction:.1f} % of the turbulence, error {sigma:.1f} m/s"
+    elif math.hypot(*velocity) >= _FASTEST:
+        reason = f"no wind below {_FASTEST:g} m/s fits"
+    return LayerWind(altitude, fraction, (float(velocity[0]), float(velocity[1])), covariance, reason)
+
+
+class _Flow:
+    """Lagged covariances of a sky, and what was measured of them.
+
+    Args:
+        measured: time (s) to (n, n) <s[k] s[k-lag]^T>, rad^2.
+    """
+
+    def __init__(self, model: SkyModel, profile: Profile, measured: Mapping[float, Array]) -> None:
+        self._model = model
+        self._outer_scale = profile.outer_scale
+        self._strengths = profile.fractions * profile.r0 ** (-5 / 3)
+        self._measured = dict(sorted(measured.items()))
+        C = model.turbulence(self._strengths, self._outer_scale).astype(np.float64) + sum(model.noise)
+        C += model.unseen(C.trace() / len(C))
+        self._C = C
+        self._inverse = np.asarray(inverse_of(C), np.float64)
+
+    def _layer(self, l: int, velocity: Array, time: float) -> Array:
+        """c_l B_l(v t), (n, n) rad^2."""
+        strengths = np.zeros_like(self._strengths)
+        strengths[l] = self._strengths[l]
+        velocities = np.tile(velocity, (len(strengths), 1))
+        return self._model.lagged(strengths, self._outer_scale, velocities, time).astype(np.float64)
+
+    def _whitened(self, matrix: Array) -> Array:
+        """A matrix A with A = C^-1: its sum over entries with another is their product in whitened slopes."""
+        return np.asarray(self._inverse @ matrix @ self._inverse)
+
+    def search(self) -> Array:
+        """(n_layers, 2) the best velocities of a grid, m/s, layer after layer."""
+        time = list(self._measured)[len(self._measured) // 2]
+        left = self._whitened(self._measured[time])
+        found = np.zeros((len(self._strengths), 2))
+        turns = 2 * np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS
+        grid = [np.zeros(2), *(v * np.array([np.cos(a), np.sin(a)]) for v in _SPEEDS[1:] for a in turns)]
+        for l in np.argsort(-self._strengths):
+            # what a velocity would take off the squares that are left
+            best = -np.inf
+            for velocity in grid:
+                B = self._layer(int(l), velocity, time)
+                gain = 2 * float(np.vdot(left, B)) - float(np.vdot(self._whitened(B), B))
+                if gain > best:
+                    best, found[l], taken = gain, velocity, B
+            left -= self._whitened(taken)
+        return found
+
+    def refine(self, velocities: Array) -> Array:
+        """(n_layers, 2) the velocities that fit all lags best, m/s, from those given."""
+        velocities = velocities.copy()
+        for _ in range(_ITERATIONS):
+            information, score = self._normal(velocities)
+            # a layer that is hardly seen stays where it is
+            ridge = np.diag(np.diag(information) * 1e-3 + np.diag(information).max() * 1e-6)
+            step = np.linalg.solve(information + ridge, score)
+            step *= min(1.0, _STRIDE / max(float(np.abs(step).max()), 1e-9))
+            velocities += step.reshape(-1, 2)
+            speed = np.hypot(*velocities.T)[:, None]
+            velocities *= np.minimum(1, _FASTEST / np.maximum(speed, 1e-9))
+            if np.abs(step).max() < _CLOSE:
+                break
+        return velocities
+
+    def _derivatives(self, velocities: Array, time: float) -> list[Array]:
+        """Of the lagged covariance by each component of each velocity, layer by layer."""
+        out = []
+        for l, velocity in enumerate(velocities):
+            for axis in np.eye(2):
+                ahead, behind = (self._layer(l, velocity + s * _STEP * axis, time) for s in (1, -1))
+                out.append((ahead - behind) / (2 * _STEP))
+        return out
+
+    def _normal(self, velocities: Array) -> tuple[Array, Array]:
+        """Normal equations: (2 n_layers, 2 n_layers) and (2 n_layers,)."""
+        n = velocities.size
+        information, score = np.zeros((n, n)), np.zeros(n)
+        for time, measured in self._measured.items():
+            model = self._model.lagged(self._strengths, self._outer_scale, velocities, time)
+            derivatives = self._derivatives(velocities, time)
+            whitened = [self._whitened(D) for D in derivatives]
+            information += np.array([[np.vdot(W, D) for D in derivatives] for W in whitened])
+            score += np.array([np.vdot(W, measured - model) for W in whitened])
+        return information, score
+
+    def covariance(self, velocities: Array, pairs: int, interval: float) -> Array:
+        """(2 n_layers, 2 n_layers) of the velocities, m^2/s^2.
+
+        Of the lag that tells most, as if there were no other: lags largely repeat each other. With Q_p the whitened
+        derivative, a score is the mean over k of ``s[k]^T Q_p s[k-lag]``; how much a frame's repeats that of frames
+        after it follows from frozen flow too.
+
+        Args:
+            pairs: of exposures in the measured moments.
+            interval: s between counted frames.
+        """
+        best: tuple[Array, list[Array]] | None = None
+        for time in self._measured:
+            derivatives = self._derivatives(velocities, time)
+            whitened = [self._whitened(D) for D in derivatives]
+            information = np.array([[np.vdot(W, D) for D in derivatives] for W in whitened])
+            if best is None or information.trace() > best[0].trace():
+                best = information, whitened
+        assert best is not None
+        information, whitened = best
+        spread = np.zeros_like(information)
+        for j in range(_LAGS + 1):
+            later = (
+                self._C
+                if j == 0
+                else self._model.lagged(self._strengths, self._outer_scale, velocities, j * interval).astype(np.float64)
+            )
+            moved = [later @ Q @ later.T for Q in whitened]
+            part = np.array([[np.vdot(Q, M) for M in moved] for Q in whitened])
+            spread += part if j == 0 else part + part.T
+            if j and np.abs(np.diag(part)).max() < _FORGOTTEN * np.diag(spread).min():
+                break
+        inverse = np.linalg.pinv(information, rcond=1e-9, hermitian=True)
+        return np.asarray(inverse @ spread @ inverse / pairs)

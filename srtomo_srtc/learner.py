@@ -1,0 +1,322 @@
+"""Learning in session: windows of telemetry in, judgements out. No ROS, no clock of its own, no thread.
+
+Every window is fitted; what the fit believes is compared with what the loop runs on, on frames that the fit has not
+seen; and what is better by :mod:`srtomo_srtc.decide`'s rules becomes a reconstructor. Whoever calls this publishes and
+commits it, and says what the loop runs (:meth:`Learner.running`). A swap that it asked for is watched, and taken back.
+"""
+
+from __future__ import annotations
+
+import enum
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from srtomo_core.reconstructor import Reconstructor
+from srtomo_core.system import System
+from srtomo_srtc.decide import Action, Comparison, Decider, Rules, State, compare
+from srtomo_srtc.health import FEWEST_BLOCKS, Estimate, FlowModel, Health, SlopeModel, block_mean
+from srtomo_srtc.learn import Learned, learn
+from srtomo_srtc.learn_wind import LayerWind, learn_winds, with_winds
+from srtomo_srtc.predict import Prediction, mean_wfe
+from srtomo_srtc.telemetry import HeldOut, Statistics
+from srtomo_srtc.wind import with_trusted_winds
+
+
+@dataclass(frozen=True, eq=False)
+class Belief:
+    """A reconstructor and the system that it was made from, whose models are kept once they are asked for.
+
+    Attributes:
+        source: where the system's sky comes from: "file", "ground" or "learned".
+    """
+
+    source: str
+    system: System
+    reconstructor: Reconstructor
+    models: dict[int, SlopeModel] = field(default_factory=dict)
+
+    def model(self, ahead: int) -> SlopeModel:
+        """What the system supposes of the slopes; with ``ahead``, also of how many exposures later."""
+        if ahead not in self.models:
+            self.models[ahead] = model_of(self.system, ahead)
+        return self.models[ahead]
+
+
+def model_of(system: System, ahead: int) -> SlopeModel:
+    """As :meth:`Belief.model`."""
+    return FlowModel(system, ahead / system.loop.rate) if ahead else SlopeModel(system)
+
+
+@dataclass(frozen=True, eq=False)
+class LearnedSky:
+    """What a window told.
+
+    Attributes:
+        learned: strengths and noise.
+        system: the instrument under that sky.
+        winds: of the system's layers; empty where they were not asked for.
+    """
+
+    learned: Learned
+    system: System
+    winds: tuple[LayerWind, ...] = ()
+
+
+def learned_sky(system: System, window: Statistics, *, winds: bool = False) -> LearnedSky:
+    """Fit a window.
+
+    Args:
+        system: the instrument as its file says.
+        winds: learn them too; each is believed as far as it is known, and where it is not seen as the file has it.
+
+    Raises:
+        LearnError: no sky can be told from it.
+    """
+    learned = learn(system, window)
+    believed = learned.system(system)
+    if not winds:
+        return LearnedSky(learned, believed)
+    found = learn_winds(believed, window)
+    believed = with_trusted_winds(with_winds(believed, found), [0.0 if wind.reason else wind.sigma for wind in found])
+    return LearnedSky(learned, believed, found)
+
+
+def lags_of(system: System, every: int) -> tuple[int, ...]:
+    """Lags, in exposures, at which telemetry shows the winds: of half a sub-aperture and a whole one at 10 m/s.
+
+    Args:
+        every: exposures from one counted frame to the next; lags are multiples of it.
+    """
+    size = min(system.telescope.diameter / sensor.subapertures for sensor in system.sensors)
+    return tuple(every * max(i, round(i * size / 20 * system.loop.rate / every)) for i in (1, 2))
+
+
+class Outcome(enum.IntEnum):
+    """Of a judgement; numbers as in ModelHealth."""
+
+    KEPT = 0
+    PUBLISHED = 1
+    ROLLED_BACK = 2
+    FAILED = 3
+
+
+@dataclass(eq=False)
+class Judgement:
+    """What became of a window, and why.
+
+    Attributes:
+        window: the telemetry that was judged.
+        active: what the loop ran; None when it is nothing of ours.
+        outcome: PUBLISHED asks for ``candidate`` to be published and committed, ROLLED_BACK for ``previous`` to be
+            rolled back to.
+        reason: for people.
+        health: of the active model.
+        sky: that was learned, unless the fit failed.
+        comparison: of the candidate with the active model.
+        watched: of the active model with the one before, while a swap is watched.
+        candidate: built where held-out frames prefer the learned sky.
+        predicted: wavefront error of the active and of the candidate's reconstructor under the learned sky, m rms.
+        seconds: that the stages took.
+    """
+
+    window: Statistics
+    active: Belief | None = None
+    previous: Belief | None = None
+    outcome: Outcome = Outcome.KEPT
+    reason: str = ""
+    health: Health | None = None
+    sky: LearnedSky | None = None
+    comparison: Comparison | None = None
+    watched: Comparison | None = None
+    candidate: Belief | None = None
+    predicted: tuple[float, float] | None = None
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    def ended(self, outcome: Outcome, reason: str) -> Judgement:
+        """Itself, with its end."""
+        self.outcome, self.reason = outcome, reason
+        return self
+
+
+def left_by_loop(held: HeldOut, some: NDArray[np.bool_]) -> Estimate:
+    """Mean square of the loop's slopes over that of the pseudo-open-loop ones, in some of the frames.
+
+    Args:
+        some: (n_held,) which frames, of at least two blocks.
+    """
+    power = float(np.mean(np.square(held.slopes[some], dtype=np.float64)))
+    left = np.mean(np.square(held.measured[some], dtype=np.float64), axis=1)
+    return block_mean(left / power, held.block[some])
+
+
+def pairs(held: HeldOut, apart: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Which held-out frames have another one so many exposures later in the same block: indices of both."""
+    at = {(block, frame): i for i, (block, frame) in enumerate(zip(held.block, held.frames, strict=True))}
+    found = [(i, at.get((block, frame + apart))) for (block, frame), i in at.items()]
+    now, later = np.array([(i, j) for i, j in found if j is not None], np.intp).reshape(-1, 2).T
+    return now, later
+
+
+@contextmanager
+def _timed(judgement: Judgement, stage: str) -> Iterator[None]:
+    since = time.perf_counter()
+    yield
+    judgement.seconds[stage] = round(time.perf_counter() - since, 3)
+
+
+Fit = Callable[[Statistics], LearnedSky]
+"""The sky from a window; raises LearnError, or another ValueError."""
+
+Build = Callable[[System], Reconstructor]
+"""A system's reconstructor."""
+
+
+class Learner:
+    """The learning of one loop. One thread calls everything.
+
+    Args:
+        system: the instrument as its file says.
+        fit: to windows.
+        build: reconstructors of learned systems.
+        rules: when a swap is worth it.
+        clock: s; a monotonic one.
+        ahead: exposures; models are judged by how well they foretell frames so much later. Of predictive
+            reconstructors: single frames say nothing of the wind. 0: by single frames.
+    """
+
+    def __init__(
+        self,
+        system: System,
+        fit: Fit,
+        build: Build,
+        rules: Rules | None = None,
+        clock: Callable[[], float] = time.monotonic,
+        ahead: int = 0,
+    ) -> None:
+        self._fit = fit
+        self._build = build
+        self._ahead = ahead
+        self._sensors = [sensor.name for sensor in system.sensors]
+        self.decider = Decider(self._sensors, rules, clock)
+        self._known: dict[int, Belief] = {}
+        self._active: Belief | None = None
+        self._previous: Belief | None = None
+        self._offered = 0
+        self._left = np.inf
+
+    def know(self, belief: Belief) -> None:
+        """A reconstructor that the loop may come to run."""
+        self._known[belief.reconstructor.id] = belief
+
+    def running(self, identity: int) -> None:
+        """The loop now runs the reconstructor of this id: after every commit and roll-back, whoever asked for it."""
+        if self._active is not None and identity == self._active.reconstructor.id:
+            return
+        before, self._active = self._active, self._known.get(identity)
+        watched = self.decider.state is State.WATCHING
+        if watched and self._previous is not None and identity == self._previous.reconstructor.id:
+            self.decider.rolled_back()
+        elif identity == self._offered and before is not None:
+            self.decider.committed(self._left)
+        else:
+            self.decider.left_alone()
+        self._previous = before
+        needed = {belief.reconstructor.id for belief in (self._active, before) if belief is not None}
+        self._known = {
+            known: belief for known, belief in self._known.items() if known in needed or belief.source != "learned"
+        }
+
+    def judge(self, window: Statistics) -> Judgement:
+        """Fit a window and decide. Takes seconds to minutes, and as much memory as a few covariances of slopes."""
+        judgement = Judgement(window, self._active, self._previous)
+        if self._active is None:
+            return judgement.ended(Outcome.FAILED, "the loop runs no reconstructor whose model is known here")
+        held = window.held_out
+        if (blocks := len(np.unique(held.block))) < FEWEST_BLOCKS:
+            reason = f"{blocks} blocks of held-out frames in the window, {FEWEST_BLOCKS} are needed"
+            return judgement.ended(Outcome.FAILED, reason)
+        model = self._active.model(self._ahead)
+        judgement.health = Health.of(model.scores(held.slopes), held.block)
+        watched = ""
+        if self.decider.state is State.WATCHING:
+            if self._watch(judgement):
+                return judgement
+            watched = judgement.reason
+        if silent := model.silent(held.measured, held.block):
+            names = ", ".join(self._sensors[w] for w in silent)
+            return judgement.ended(Outcome.FAILED, f"no candidate: the slopes of {names} stand still")
+        self._consider(judgement)
+        if watched:
+            judgement.reason = f"{watched}; {judgement.reason}"
+        return judgement
+
+    def _watch(self, judgement: Judgement) -> bool:
+        """Judge the last swap by the frames since; whether it is to be taken back."""
+        held, active, previous = judgement.window.held_out, self._active, self._previous
+        assert active is not None and previous is not None
+        since = held.reconstructor == active.reconstructor.id
+        if len(np.unique(held.block[since])) < FEWEST_BLOCKS:
+            judgement.reason = "watching: too few frames since the swap"
+            return False
+        model = active.model(self._ahead)
+        try:
+            judgement.watched = self._compared(model, previous.model(self._ahead), held, since)
+        except ValueError as error:  # of frames in pairs there may be fewer
+            judgement.reason = f"watching: {error}"
+            return False
+        decision = self.decider.watch(judgement.watched, model.explained, left_by_loop(held, since))
+        judgement.ended(Outcome.ROLLED_BACK if decision.action is Action.ROLL_BACK else Outcome.KEPT, decision.reason)
+        return decision.action is Action.ROLL_BACK
+
+    def _compared(
+        self, candidate: SlopeModel, active: SlopeModel, held: HeldOut, some: NDArray[np.bool_] | None = None
+    ) -> Comparison:
+        """Two models by held-out frames, or by some of these."""
+        chosen = np.ones(len(held.frames), bool) if some is None else some
+        if not (isinstance(candidate, FlowModel) and isinstance(active, FlowModel)):
+            slopes, block = held.slopes[chosen], held.block[chosen]
+            return compare(candidate.scores(slopes), active.scores(slopes), candidate.n_seen, block)
+        now, later = pairs(held, self._ahead)
+        now, later = now[chosen[later]], later[chosen[later]]
+        frames = held.slopes[now], held.slopes[later]
+        new, old = candidate.scores_ahead(*frames), active.scores_ahead(*frames)
+        return compare(new, old, candidate.n_seen, held.block[later])
+
+    def _consider(self, judgement: Judgement) -> Judgement:
+        """Fit the window, compare, and build what is better."""
+        active, held = self._active, judgement.window.held_out
+        assert active is not None
+        try:
+            with _timed(judgement, "fit"):
+                judgement.sky = self._fit(judgement.window)
+                system = judgement.sky.system
+            with _timed(judgement, "comparison"):
+                model = model_of(system, self._ahead)
+                comparison = judgement.comparison = self._compared(model, active.model(self._ahead), held)
+        except (ValueError, np.linalg.LinAlgError) as error:
+            return judgement.ended(Outcome.FAILED, f"no candidate: {error}")
+        preference = self.decider.prefers(comparison, model.explained)
+        if preference.action is not Action.COMMIT:
+            return judgement.ended(Outcome.KEPT, preference.reason)
+        with _timed(judgement, "reconstructor"):
+            candidate = Belief("learned", system, self._build(system), {self._ahead: model})
+        with _timed(judgement, "prediction"):
+            two = active.reconstructor, candidate.reconstructor
+            prediction = Prediction(system, epochs=max(reconstructor.n_epochs for reconstructor in two))
+            before, after = (mean_wfe(prediction.budgets(reconstructor.R)) for reconstructor in two)
+        judgement.predicted = before, after
+        decision = self.decider.gains(preference, before, after)
+        if decision.action is not Action.COMMIT:
+            return judgement.ended(Outcome.KEPT, decision.reason)
+        judgement.candidate = candidate
+        self.know(candidate)
+        self._offered = candidate.reconstructor.id
+        running = held.reconstructor == active.reconstructor.id
+        enough = len(np.unique(held.block[running])) > 1
+        self._left = float(left_by_loop(held, running).mean) if enough else np.inf
+        return judgement.ended(Outcome.PUBLISHED, decision.reason)
