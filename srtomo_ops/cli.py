@@ -43,6 +43,7 @@ GROUPS: dict[str, tuple[Command, ...]] = {
     "Bags": (
         Command("replay", "put a bag through the loop again and compare commands bit for bit"),
         Command("estimate", "learn the sky from a bag: r0, profile, noise, with their errors"),
+        Command("register", "where each sensor sits against the mirrors, from a bag or an interaction matrix"),
         Command("bag", "say what a bag holds, or repair a cut-off one"),
     ),
 }

@@ -33,7 +33,7 @@ UNSEEN = 3.0
 """Error of a velocity's component, m/s, beyond which a layer's wind is said not to be seen."""
 
 _SPEEDS = np.arange(0.0, 31.0, 5.0)  # m/s, of the grid
-_DIRECTIONS = 12
+_DIRECTIONS = 12  # an even number
 _STEP = 0.3  # m/s, of the central differences
 _ITERATIONS = 8
 _CLOSE = 0.02  # m/s: a step this small is the last
@@ -161,10 +161,9 @@ class _Flow:
 
     def _layer(self, l: int, velocity: Array, time: float) -> Array:
         """c_l B_l(v t), (n, n) rad^2."""
-        strengths = np.zeros_like(self._strengths)
-        strengths[l] = self._strengths[l]
-        velocities = np.tile(velocity, (len(strengths), 1))
-        return self._model.lagged(strengths, self._outer_scale, velocities, time).astype(np.float64)
+        alone = slice(l, l + 1)
+        seen = self._model.lagged(self._strengths[alone], self._outer_scale, velocity[None], time, alone)
+        return seen.astype(np.float64)
 
     def _whitened(self, matrix: Array) -> Array:
         """A matrix A with A = C^-1: its sum over entries with another is their product in whitened slopes."""
@@ -175,16 +174,19 @@ class _Flow:
         time = list(self._measured)[len(self._measured) // 2]
         left = self._whitened(self._measured[time])
         found = np.zeros((len(self._strengths), 2))
-        turns = 2 * np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS
+        # the other half are their opposites: B_l(-d) = B_l(d)^T
+        turns = 2 * np.pi * np.arange(_DIRECTIONS // 2) / _DIRECTIONS
         grid = [np.zeros(2), *(v * np.array([np.cos(a), np.sin(a)]) for v in _SPEEDS[1:] for a in turns)]
         for l in np.argsort(-self._strengths):
             # what a velocity would take off the squares that are left
             best = -np.inf
             for velocity in grid:
                 B = self._layer(int(l), velocity, time)
-                gain = 2 * float(np.vdot(left, B)) - float(np.vdot(self._whitened(B), B))
-                if gain > best:
-                    best, found[l], taken = gain, velocity, B
+                square = float(np.vdot(self._whitened(B), B))
+                for there, correlation in ((velocity, B), (-velocity, B.T)):
+                    gain = 2 * float(np.vdot(left, correlation)) - square
+                    if gain > best:
+                        best, found[l], taken = gain, there, correlation
             left -= self._whitened(taken)
         return found
 

@@ -72,15 +72,19 @@ class SkyModel:
         above, below = (self.turbulence(strengths, outer_scale * np.exp(s * _DIFFERENCE)) for s in (1, -1))
         return np.asarray((above - below) / np.float32(2 * _DIFFERENCE))
 
-    def lagged(self, strengths: Array, outer_scale: float, velocity: Array, time: float) -> Single:
+    def lagged(
+        self, strengths: Array, outer_scale: float, velocity: Array, time: float, layers: slice = slice(None)
+    ) -> Single:
         """Covariance of the turbulence's slopes with those a ``time`` (s) earlier in frozen flow, (n, n).
 
         Args:
-            velocity: (n_layers, 2) where each layer goes, m/s.
+            strengths: (n_layers,) of each layer that takes part.
+            velocity: (n_layers, 2) where each of them goes, m/s.
+            layers: that take part.
         """
         n = len(self)
         # without extrapolation: correlations are asked for, and the missing part hardly shows in these
-        lines = self._grids[0][1]
+        lines = [line.only(layers) for line in self._grids[0][1]]
         both = [*lines, *(_moved(line, velocity, time) for line in lines)]
         return self._projected(self._slopes(strengths, outer_scale, both)[n:, :n].T)
 

@@ -26,6 +26,7 @@ MAY_IMPORT_ROS = (
     "srtomo_srtc/node.py",
     "srtomo_srtc/listener.py",  # the node's hot endpoints
     "srtomo_ops/operator.py",  # calls the nodes
+    "srtomo_ops/dither.py",  # asks the HRTC for it
     "srtomo_ops/publish.py",
     "srtomo_ops/demo.py",
     "srtomo_ops/commands/ctl.py",

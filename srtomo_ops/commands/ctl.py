@@ -8,6 +8,8 @@ import math
 import time
 from typing import TYPE_CHECKING
 
+from srtomo_core.system import load_system
+from srtomo_core.units import parse
 from srtomo_ops.options import add_json, assignments, seconds, write_json
 
 if TYPE_CHECKING:
@@ -20,20 +22,23 @@ EXAMPLE = """examples:
   srtomo ctl commit 0123456789abcdef 0123...   id and SHA-256, in hex, as 'srtomo ctl publish' printed them
   srtomo ctl close                          close the loop
   srtomo ctl sky --set 'atmosphere.r0=10 cm' --over 10s    change the simulated plant while it runs
+  srtomo ctl dither gnao_ltao_sr --rms 5nm --over 30s      for 'srtomo register': shakes the mirrors, then flat
   srtomo ctl status"""
 
 _PATIENCE = 10.0  # s to find a node: one that was just started takes some seconds
 
 _ACTIONS = (
     "status", "configure", "activate", "deactivate", "cleanup", "close", "open", "start-sim", "publish", "commit",
-    "roll-back", "sky",
+    "roll-back", "sky", "dither",
 )  # fmt: skip
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Arguments of the command."""
     parser.add_argument("action", choices=_ACTIONS, metavar="ACTION", help=", ".join(_ACTIONS))
-    parser.add_argument("words", metavar="WORD", nargs="*", help="publish: LABEL; commit, roll-back: ID SHA256 (hex)")
+    parser.add_argument(
+        "words", metavar="WORD", nargs="*", help="publish: LABEL; commit, roll-back: ID SHA256 (hex); dither: SYSTEM"
+    )
     parser.add_argument("--namespace", default="", help="of the instrument (default: none)")
     parser.add_argument(
         "--set",
@@ -42,8 +47,13 @@ def configure(parser: argparse.ArgumentParser) -> None:
         default=[],
         help="sky: what changes, with unit: atmosphere.r0, a layer's fraction or wind, a sensor's photons or place",
     )
-    parser.add_argument("--over", metavar="TIME", type=seconds, default=0.0, help="sky: how long it takes (default: 0)")
+    parser.add_argument(
+        "--over", metavar="TIME", type=seconds, default=0.0, help="sky, dither: how long it takes (default: 0)"
+    )
     parser.add_argument("--after", metavar="TIME", type=seconds, default=0.0, help="sky: when it begins (default: now)")
+    parser.add_argument(
+        "--rms", metavar="LENGTH", default="5 nm", help="dither: of the wavefront, rms over the pupil (default: 5 nm)"
+    )
     add_json(parser)
 
 
@@ -54,7 +64,9 @@ def main(options: argparse.Namespace) -> int:
 
     from srtomo_ops.operator import TRANSITIONS, Operator
 
-    expected = {"publish": "LABEL", "commit": "ID SHA256", "roll-back": "ID SHA256"}.get(options.action, "")
+    expected = {"publish": "LABEL", "commit": "ID SHA256", "roll-back": "ID SHA256", "dither": "SYSTEM"}.get(
+        options.action, ""
+    )
     if len(options.words) != len(expected.split()):
         raise ValueError(
             f"{options.action}: expected {expected or 'nothing'} after it, got {' '.join(options.words) or 'nothing'}"
@@ -62,6 +74,12 @@ def main(options: argparse.Namespace) -> int:
     if options.action in ("commit", "roll-back"):
         identity, sha256 = _identity(*options.words)
     changes = _changes(options)
+    if options.action == "dither":
+        if not options.over:
+            raise ValueError("dither: expected --over TIME, how long it takes")
+        from srtomo_ops.dither import Dither
+
+        dither = Dither(load_system(options.words[0]), parse("length", options.rms))
     # rclpy's own handlers end the context under the call that Ctrl-C interrupts
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     operator = Operator(options.namespace, "ctl", patience=_PATIENCE)
@@ -81,6 +99,8 @@ def main(options: argparse.Namespace) -> int:
             numbers = {"first_frame": operator.commit(identity, sha256, roll_back=options.action == "roll-back")}
         elif options.action == "sky":
             numbers = {"first_frame": operator.change_sky(changes, options.over, options.after)}
+        elif options.action == "dither":
+            numbers = {"sign_changes": dither.run(operator, options.over)}
         else:
             numbers = _status(operator)
     finally:

@@ -8,12 +8,14 @@ import json
 import textwrap
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from types import UnionType
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from srtomo_ops.options import add_json, add_system, assignments, system_of, writable_file, write_json
 from srtomo_ops.progress import Progress
+from srtomo_ops.registration import add_registration, registered_layout
 from srtomo_srtc.measured import read_measured
 from srtomo_srtc.model import ground_prior
 from srtomo_srtc.reconstructors import METHODS
@@ -96,6 +98,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--method", choices=sorted(METHODS), default="implicit", help="how (default: implicit); all are listed below"
     )
     add_keywords(parser)
+    add_registration(parser)
     parser.add_argument(
         "--measured",
         metavar="FILE",
@@ -157,13 +160,16 @@ def main(options: argparse.Namespace) -> int:
         if options.method != "learn_apply":
             raise ValueError(f"--measured: expected with --method learn_apply, not {options.method}")
         keywords |= read_measured(str(options.measured), system)
+    layout, registration = registered_layout(options.registration, system)
     believed = ground_prior(system) if options.prior == "ground" else system
     start = time.perf_counter()
     with Progress("reconstructor") as progress:
         reconstructor, G = METHODS[options.method](
-            believed, label=options.label or options.prior, progress=progress.stage, **keywords
+            believed, layout, label=options.label or options.prior, progress=progress.stage, **keywords
         )
     seconds = time.perf_counter() - start
+    if registration:
+        reconstructor = replace(reconstructor, provenance={**reconstructor.provenance, "registration": registration})
     reconstructor.save(options.output, G)
     exposures = f" of {reconstructor.n_epochs} exposures" if reconstructor.n_epochs > 1 else ""
     print(
