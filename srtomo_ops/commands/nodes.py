@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import importlib
 import json
+from typing import Any
 
 from srtomo_ops.options import add_system, changes_of, system_of
 
@@ -33,24 +34,36 @@ def ros_arguments(system: str, changes: dict[str, object], namespace: str, param
     if namespace:
         words += ["-r", f"__ns:=/{namespace.strip('/')}"]
     for parameter in parameters:
-        if ":=" not in parameter:
-            raise ValueError(f"-p {parameter}: expected NAME:=VALUE")
         words += ["-p", parameter]
     return words
+
+
+def quoted(parameter: str, defaults: dict[str, Any]) -> str:
+    """``NAME:=VALUE`` as ROS reads it: YAML, which would take a text with brackets for a list.
+
+    Raises:
+        ValueError: the node has no such parameter; ROS takes those without a word.
+    """
+    name, colon, value = parameter.partition(":=")
+    if not colon:
+        raise ValueError(f"-p {parameter}: expected NAME:=VALUE")
+    if name not in defaults:
+        raise ValueError(f"-p {parameter}: no such parameter (expected one of {', '.join(defaults)})")
+    if isinstance(defaults[name], str) and not value.startswith(("'", '"')):
+        value = "'" + value.replace("'", "''") + "'"
+        return f"{name}:={value}"
+    return parameter
 
 
 def main(options: argparse.Namespace) -> int:
     """Run the command."""
     system_of(options)  # a wrong instrument is refused here, in one line
-    arguments = ros_arguments(options.system, changes_of(options), options.namespace, options.p)
     module = importlib.import_module(_MODULES[options.command])
     if options.parameters:
         for name, default, description in module.parameters():
             print(f"{name:<20} {default!r:<10} {description}")
         return 0
-    known = [name for name, _, _ in module.parameters()]
-    for parameter in options.p:
-        # ROS takes parameters that no node declares, without a word
-        if (name := parameter.partition(":=")[0]) not in known:
-            raise ValueError(f"-p {parameter}: no such parameter (expected one of {', '.join(known)})")
+    defaults = {name: default for name, default, _ in module.parameters()}
+    parameters = [quoted(parameter, defaults) for parameter in options.p]
+    arguments = ros_arguments(options.system, changes_of(options), options.namespace, parameters)
     return int(module.main(arguments))

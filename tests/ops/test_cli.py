@@ -226,6 +226,18 @@ def _apart(*words: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
 
 
+def test_text_with_brackets_stays_text() -> None:
+    defaults = {"schedule": "", "frames": 10, "priors": ["file"]}
+    for given, passed in (
+        ('schedule:=[{"at": 5}]', """schedule:='[{"at": 5}]'"""),
+        ("schedule:='[]'", "schedule:='[]'"),
+        ("schedule:=it's", "schedule:='it''s'"),
+        ("frames:=20", "frames:=20"),
+        ("priors:=[ground]", "priors:=[ground]"),
+    ):
+        assert quoted(given, defaults) == passed
+
+
 def test_a_node_lists_its_parameters_and_refuses_others() -> None:
     pytest.importorskip("rclpy")
     listed = _apart("hrtc", "mini", "--parameters")
