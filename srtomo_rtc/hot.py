@@ -169,6 +169,11 @@ class HotEndpoints:
             strangers.append(f"{known - readers} readers of {command}")
         return " and ".join(strangers) + " do not match: incompatible quality of service" if strangers else ""
 
+    def rivals(self) -> str:
+        """Who else publishes commands; empty: nobody. Not the loop's thread."""
+        others = self._node.count_publishers(self._publisher.topic_name) - 1
+        return f"{others} others publish {self._publisher.topic_name}: another HRTC runs here" if others > 0 else ""
+
     def destroy(self) -> None:
         """Give the endpoints back; the loop's thread has left by then."""
         self._node.destroy_subscription(self._subscription)

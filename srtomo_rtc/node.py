@@ -34,6 +34,7 @@ from msgs_schema.msg import Reconstructor as ReconstructorMsg
 from msgs_schema.msg import ReconstructorBlock as ReconstructorBlockMsg
 from msgs_schema.srv import PublishReconstructor, SetStaticShape, SwapReconstructor
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
+from rclpy.clock import Clock, ClockType
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.node import Node
@@ -137,8 +138,10 @@ class HrtcNode(LifecycleNode):
             QoSProfile(**wire.RECONSTRUCTOR_BLOCK.qos()),
             raw=True,
         )
-        self.create_timer(0.1, self._every_100_ms)
-        self.create_timer(1.0, self._every_second)
+        # timers of the system's clock would stop for as long as it is set back
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self.create_timer(0.1, self._every_100_ms, clock=steady)
+        self.create_timer(1.0, self._every_second, clock=steady)
         self._worker = ThreadPoolExecutor(max_workers=1, thread_name_prefix="staging")
         self._manifest: Manifest | None = None
         self._early_blocks: deque[wire.ReconstructorBlock] = deque(maxlen=wire.RECONSTRUCTOR_BLOCK.depth)
@@ -665,9 +668,8 @@ class HrtcNode(LifecycleNode):
         silence = (time.monotonic_ns() - hrtc.last_slopes_ns) * 1e-9
         if hrtc.loop.opened_by_faults:
             return DiagnosticStatus.ERROR, f"the loop opened by itself {hrtc.loop.opened_by_faults} times"
-        unmatched = self._hot.unmatched() if self._hot is not None else ""
-        if unmatched:
-            return DiagnosticStatus.WARN, unmatched
+        if self._hot is not None and (trouble := self._hot.rivals() or self._hot.unmatched()):
+            return DiagnosticStatus.WARN, trouble
         if not hrtc.session:
             return DiagnosticStatus.OK, "waiting for slopes"
         if silence > _SILENT:

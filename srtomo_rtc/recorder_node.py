@@ -33,6 +33,7 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 
 from srtomo_core.bag import BagError, BagWriter
+from srtomo_core.clock import ArrivalClock
 from srtomo_core.layout import Layout
 from srtomo_core.system import InstrumentError, System, load_system
 from srtomo_core.wire import COMMAND, EVENT, RECORDER_STATUS, SLOPES, TOPICS, Topic
@@ -53,7 +54,7 @@ _UNRECORDED = "a publisher offers less than reliable (or transient local) delive
 
 
 class _Record(NamedTuple):
-    """A message on its way to the bag; times in ns since the epoch."""
+    """A message on its way to the bag; times in ns since the epoch, ``received`` by a clock that nobody sets."""
 
     received: int
     tap: _Tap
@@ -70,6 +71,7 @@ class _Tap:
     name: str
     message_type: type
     subscription: Any
+    clock: ArrivalClock
     recorded: int = 0
     last_sequence: int = 0
     skipped: int = 0
@@ -90,7 +92,8 @@ class _Tap:
                 self.skipped += sequence - self.last_sequence - 1
             self.last_sequence = sequence
             self.recorded += 1
-            yield _Record(info["received_timestamp"], self, data, info["source_timestamp"], sequence)
+            received = self.clock.start + self.clock.monotonic(info["received_timestamp"])
+            yield _Record(received, self, data, info["source_timestamp"], sequence)
 
 
 class _Scribe(threading.Thread):
@@ -166,6 +169,7 @@ class Recorder:
             layout.fingerprint,
             math.ceil(_IN_FLIGHT * rate),
         )
+        self._clock = ArrivalClock()
         self._node = Node("recorder", namespace=namespace or None, enable_rosout=False, start_parameter_services=False)
         status_qos = QoSProfile(**RECORDER_STATUS.qos())
         self._status = self._node.create_publisher(RecorderStatus, RECORDER_STATUS.name, status_qos)
@@ -188,7 +192,7 @@ class Recorder:
         )
         full_name = subscription.topic_name
         self._bag.declare(full_name, topic.type, depth=depth, transient_local=topic.transient_local)
-        return _Tap(topic, full_name, message_type, subscription)
+        return _Tap(topic, full_name, message_type, subscription, self._clock)
 
     def record(self, stop: threading.Event) -> None:
         """Record until ``stop`` is set and what was sent by then is in the bag, then close the bag.

@@ -34,6 +34,7 @@ from msgs_schema.msg import AtmosphereProfile, DmCommand, SimStatus, TelescopeSt
 from msgs_schema.msg import SlopeFrame as SlopeFrameMsg
 from msgs_schema.srv import ChangeSky
 from rcl_interfaces.msg import ParameterDescriptor
+from rclpy.clock import Clock, ClockType
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
@@ -41,6 +42,7 @@ from rclpy.signals import SignalHandlerOptions
 from std_srvs.srv import Trigger
 
 from srtomo_core import wire
+from srtomo_core.clock import ArrivalClock
 from srtomo_core.layout import Layout
 from srtomo_core.system import InstrumentError, System, load_system
 from srtomo_sim.course import Change, alters_turbulence, scheduled
@@ -164,9 +166,12 @@ class SimNode(Node):
         self._reported = 0
         self._last_report = (time.monotonic(), -1)
         self._told: AtmosphereProfile | None = None
-        self.create_timer(0.1, self._report)
+        self._warned = False
+        # timers of the system's clock would stop for as long as it is set back
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self.create_timer(0.1, self._report, clock=steady)
         self._report_telescope()
-        self.create_timer(1.0, self._report_telescope)
+        self.create_timer(1.0, self._report_telescope, clock=steady)
         gc.collect()
         gc.freeze()
         self._thread.start()
@@ -240,11 +245,10 @@ class SimNode(Node):
         period = 1 / self._system.loop.rate
         rest = self._system.loop.delay % 1
         start = time.monotonic() + 0.05
-        # the middleware stamps what it receives with the system's clock
-        offset = time.time() - time.monotonic()
+        clock = ArrivalClock()
         for k in range(self._values["frames"]):
             self._sleep_until(start + (k + rest) * period)
-            self._drain(start + offset, period)
+            self._drain(clock, start, period)
             if not self._has_sky(k):
                 return
             slopes = self._plant.measure(k)
@@ -261,7 +265,7 @@ class SimNode(Node):
                 return
             self._publish(k, slopes, on.frame, on.before, on.fraction)
         self._sleep_until(time.monotonic() + 2 * period)
-        self._drain(start + offset, period)
+        self._drain(clock, start, period)
 
     def _lockstep(self) -> None:
         for k in range(self._values["frames"]):
@@ -292,25 +296,28 @@ class SimNode(Node):
             taken = self._commands.handle.take_message(DmCommand, True)
             if taken is None:
                 return False
-            command = wire.read_dm_command(taken[0])
-            if command.session == self.session:
-                self._plant.command(command.frame, command.commands)
-                if command.frame == frame:
-                    return True
+            if self._obey(taken[0], None) == frame:
+                return True
 
-    def _drain(self, start: float, period: float) -> None:
-        """Hand in every command that came, with its time of arrival in frames since ``start`` (system's clock)."""
+    def _drain(self, clock: ArrivalClock, start: float, period: float) -> None:
+        """Hand in every command that came, with its time of arrival in frames since ``start`` (monotonic clock, s)."""
         while True:
             taken = self._commands.handle.take_message(DmCommand, True)
             if taken is None:
                 return
-            try:
-                command = wire.read_dm_command(taken[0])
-                if command.session == self.session:
-                    arrival = (taken[1]["received_timestamp"] * 1e-9 - start) / period
-                    self._plant.command(command.frame, command.commands, arrival)
-            except ValueError as error:
-                self.get_logger().warning(f"command dropped: {error}")
+            self._obey(taken[0], (clock.monotonic(taken[1]["received_timestamp"]) * 1e-9 - start) / period)
+
+    def _obey(self, message: bytes, arrival: float | None) -> int | None:
+        """Hand one command in; its frame, or None if it is not one for this plant."""
+        try:
+            command = wire.read_dm_command(message)
+            if command.session != self.session:
+                return None
+            self._plant.command(command.frame, command.commands, arrival)
+        except ValueError as error:
+            self.get_logger().warning(f"command dropped: {error}")
+            return None
+        return command.frame
 
     def _publish(self, frame: int, slopes: np.ndarray, on: int, before: int, fraction: float) -> None:
         stamp = time.time_ns()
@@ -372,6 +379,10 @@ class SimNode(Node):
             message.wfe_tip_tilt = float(np.sqrt(np.mean([error[2][0] ** 2 for error in recent])))
             message.strehl = float(strehl(high_order, wavelength).mean())
         self._statuses.publish(message)
+        several = self._commands.get_publisher_count() > 1
+        if several and not self._warned:
+            self.get_logger().warning(f"several publishers of {wire.COMMAND.name}: the mirror obeys whichever is first")
+        self._warned = several
         self._report_truth(truth, max(frame, 0))
 
     def _report_truth(self, truth: System, frame: int) -> None:

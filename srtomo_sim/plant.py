@@ -161,8 +161,10 @@ class Plant:
                 exposure that was measured, which is what lockstep means.
 
         Raises:
-            ValueError: wrong shape, or not finite.
+            ValueError: wrong shape, not finite, or of a frame that has not been measured: nobody can have made it.
         """
+        if not 0 <= frame < self._now:
+            raise ValueError(f"command of frame {frame}: exposures up to {self._now - 1} are over")
         self._line.put(frame, commands, self._now if arrival is None else arrival)
 
     def on_mirror(self, frame: int) -> OnMirror:

@@ -31,6 +31,7 @@ from msgs_schema.msg import Reconstructor as ReconstructorMsg
 from msgs_schema.msg import ReconstructorBlock as ReconstructorBlockMsg
 from msgs_schema.srv import PublishReconstructor, SwapReconstructor
 from rcl_interfaces.msg import ParameterDescriptor
+from rclpy.clock import Clock, ClockType
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
@@ -256,8 +257,10 @@ class SrtcNode(Node):
         self.create_subscription(HrtcStatus, wire.STATUS.name, self._on_status, QoSProfile(**wire.STATUS.qos()))
         self._commit = self.create_client(SwapReconstructor, "hrtc/commit")
         self._roll_back = self.create_client(SwapReconstructor, "hrtc/roll_back")
-        self.create_timer(0.1, partial(self._follow, self._listener, self._worker))
-        self.create_timer(1.0, partial(self._diagnose, self._listener))
+        # timers of the system's clock would stop for as long as it is set back
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self.create_timer(0.1, partial(self._follow, self._listener, self._worker), clock=steady)
+        self.create_timer(1.0, partial(self._diagnose, self._listener), clock=steady)
 
     def _on_status(self, status: HrtcStatus) -> None:
         if self._worker is not None and (self._status is None or status.reconstructor != self._status.reconstructor):

@@ -15,6 +15,7 @@ from srtomo_core.layout import Layout
 from srtomo_core.reconstructor import Reconstructor, load_interaction_matrix
 from srtomo_core.system import load_system, system_names
 from srtomo_ops import cli
+from srtomo_ops.commands.nodes import quoted
 
 COMMANDS = [command for group in cli.GROUPS.values() for command in group]
 
