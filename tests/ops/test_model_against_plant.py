@@ -14,6 +14,7 @@ import pytest
 
 from srtomo_core.layout import Layout
 from srtomo_core.system import System, load_system
+from srtomo_sim.course import Course
 from srtomo_sim.plant import Plant
 from srtomo_sim.shack_hartmann import atmospheric_slopes
 from srtomo_sim.sky import Sky
@@ -55,7 +56,7 @@ def slopes(mini: System) -> np.ndarray:
     for seed in SEEDS:
         turbulence = atmospheric_slopes(mini, layout, Visits(mini, seed), FRAMES)
         no_mirror = np.zeros((layout.n_slopes, layout.n_commands), np.float32)
-        plant = Plant(mini, Sky(mini, layout, seed, turbulence, no_mirror, 1, ()))
+        plant = Plant(mini, Sky(mini, layout, seed, turbulence, no_mirror, 1, (), Course(mini)))
         measured.append([plant.measure(frame) for frame in range(FRAMES)])
     return np.array(measured, np.float64)
 

@@ -10,6 +10,7 @@ from srtomo_core.system import System, load_system
 from srtomo_ops import cli
 from srtomo_ops.reproduce import gnao
 from srtomo_ops.reproduce.trials import Outcome, Trial, direct, measure, quadrature, with_electrons
+from srtomo_sim.course import Course
 from srtomo_sim.plant import Plant
 from srtomo_sim.sky import Sky
 from srtomo_srtc.reconstructors.implicit import implicit
@@ -72,7 +73,9 @@ def test_the_plant_s_laser_tip_tilt_makes_no_command(name: str) -> None:
     system = load_system(name)
     layout = Layout(system)
     still = np.zeros((1, layout.n_slopes), np.float32)
-    sky = Sky(system, layout, 1, still, np.zeros((layout.n_slopes, layout.n_commands), np.float32), 1, ())
+    sky = Sky(
+        system, layout, 1, still, np.zeros((layout.n_slopes, layout.n_commands), np.float32), 1, (), Course(system)
+    )
     quiet = system.with_changes({"guide_stars.*.jitter": 0.0})
     tilt = Plant(system, sky).measure(0).astype(np.float64) - Plant(quiet, sky).measure(0)
     assert np.std(tilt) > 1e-6  # some tenths of an arcsec, along each sensor's own axes
