@@ -44,9 +44,7 @@ def quoted(parameter: str, defaults: dict[str, Any]) -> str:
     Raises:
         ValueError: the node has no such parameter; ROS takes those without a word.
     """
-    name, colon, value = parameter.partition(":=")
-    if not colon:
-        raise ValueError(f"-p {parameter}: expected NAME:=VALUE")
+    name, _, value = parameter.partition(":=")
     if name not in defaults:
         raise ValueError(f"-p {parameter}: no such parameter (expected one of {', '.join(defaults)})")
     if isinstance(defaults[name], str) and not value.startswith(("'", '"')):
@@ -58,6 +56,9 @@ def quoted(parameter: str, defaults: dict[str, Any]) -> str:
 def main(options: argparse.Namespace) -> int:
     """Run the command."""
     system_of(options)  # a wrong instrument is refused here, in one line
+    for parameter in options.p:
+        if ":=" not in parameter:
+            raise ValueError(f"-p {parameter}: expected NAME:=VALUE")
     module = importlib.import_module(_MODULES[options.command])
     if options.parameters:
         for name, default, description in module.parameters():
