@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from srtomo_core.layout import Layout
+from srtomo_core.ring import RingWriter
 from srtomo_rtc import native
 from srtomo_rtc.latency import LatencyHistogram
 from srtomo_rtc.loop import HISTORY, Loop, Owner, Program, check_size
@@ -182,6 +183,11 @@ class Hrtc:
     def not_flat(self) -> bool:
         """Whether anything is on the mirror that a stopping loop has to take off."""
         return bool(lib.srt_gate_not_flat(self.gate))
+
+    def record_to(self, ring: RingWriter | None) -> None:
+        """From now on put every message offered (channel 0) and every command that went out (channel 1) into a ring,
+        which must stay open until this was called again; None: into none. While the loop's thread does not run."""
+        self._c.ring = native.Ring() if ring is None else native.Ring(ring.address, ring.capacity, ring.ahead)
 
     # -- from the loop's thread -------------------------------------------------------------------------------------
 

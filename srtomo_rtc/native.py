@@ -158,6 +158,18 @@ class Snapshot(Structure):
     ]
 
 
+class Ring(Structure):
+    """``srt_ring``."""
+
+    _fields_ = [
+        ("memory", c_void_p),
+        ("capacity", c_uint64),
+        ("ahead", c_int64),
+        ("position", c_uint64),
+        ("number", c_uint64),
+    ]
+
+
 class Gate(Structure):
     """``srt_gate``."""
 
@@ -170,6 +182,7 @@ class Gate(Structure):
         ("largest_message", c_size_t),
         ("publish", PUBLISH),
         ("publish_context", c_void_p),
+        ("ring", Ring),
         ("failure", c_int32),
         ("stop", c_int32),
     ]

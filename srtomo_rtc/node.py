@@ -46,6 +46,7 @@ from std_srvs.srv import SetBool
 from srtomo_core import wire
 from srtomo_core.layout import Layout
 from srtomo_core.reconstructor import Reconstructor, ReconstructorError, load_interaction_matrix
+from srtomo_core.ring import RingWriter, ring_path
 from srtomo_core.system import InstrumentError, load_system
 from srtomo_rtc.events import EventKind, change_fields, event_fields, state_fields
 from srtomo_rtc.hot import HotEndpoints
@@ -58,15 +59,19 @@ _ADOPTION_TIMEOUT = 2.0  # s for the loop to take up what was posted: it does be
 _RESEND_AFTER = 1.0  # s without a new block before missing ones are asked for
 _SILENT = 0.1  # s without slopes that are worth a warning
 _GIVE_UP_AFTER = 10.0  # s without a new block before a transfer is refused
+_MESSAGE_HEAD = 192  # bytes of a message in the ring beside its slopes or commands, about
+_LEAST_RING = 1 << 20  # bytes
 
 
 def _read_only(description: str) -> ParameterDescriptor:
     return ParameterDescriptor(description=description, read_only=True)
 
 
-def _number(description: str, low: float, high: float) -> ParameterDescriptor:
+def _number(description: str, low: float, high: float, read_only: bool = False) -> ParameterDescriptor:
     return ParameterDescriptor(
-        description=description, floating_point_range=[FloatingPointRange(from_value=low, to_value=high)]
+        description=description,
+        read_only=read_only,
+        floating_point_range=[FloatingPointRange(from_value=low, to_value=high)],
     )
 
 
@@ -94,6 +99,7 @@ _PARAMETERS: tuple[tuple[str, Any, ParameterDescriptor], ...] = (
     ("cores", "", _read_only("cores that the loop's thread is kept on, as 2,3; empty: any")),
     ("fifo_priority", 0, _integer("SCHED_FIFO priority of the process; 0: normal scheduling", 0, 99, True)),
     ("deadline", 0.0, _read_only("latency above which a frame is a miss, s; 0: the loop's delay less one exposure")),
+    ("ring", 10.0, _number("s of messages kept in shared memory for the recorder; 0: none", 0.0, 600.0, True)),
     ("polc", True, ParameterDescriptor(description="pseudo-open-loop control; false: classical leaky integrator")),
     ("leak", 0.0, _number("leak of a frame; 0 at configure: the instrument's", 0.0, 0.999)),
     ("relaxation", 0.1, _number("share of the command that an open loop drops each frame", 0.001, 1.0)),
@@ -155,6 +161,7 @@ class HrtcNode(LifecycleNode):
         self._hrtc: Hrtc | None = None
         self._swap: Swap | None = None
         self._hot: HotEndpoints | None = None
+        self._ring: RingWriter | None = None
         self._thread: threading.Thread | None = None
         self._lifecycle = "unconfigured"
         self.failure: str | None = None
@@ -250,7 +257,7 @@ class HrtcNode(LifecycleNode):
             max_behind=self._value("max_behind"),
             max_epochs=self._value("max_epochs"),
         )
-        self._hot, self._swap, self._layout = hot, swap, layout
+        self._hot, self._swap, self._layout, self._rate = hot, swap, layout, loop.rate
         try:
             self._load_first()
         except ValueError:
@@ -290,8 +297,37 @@ class HrtcNode(LifecycleNode):
     def _activate(self) -> None:
         assert self._hrtc is not None
         self._hrtc.stopping = False
+        self._open_ring(self._hrtc)
         self._thread = threading.Thread(target=self._run, name="loop", daemon=True)
         self._thread.start()
+
+    def _open_ring(self, hrtc: Hrtc) -> None:
+        """While the loop runs everything that it takes and publishes goes into a ring, if there can be one.
+
+        Its length holds for one message a sensor; packets have more heads, and fill it sooner.
+        """
+        name, seconds = "telemetry ring", self._value("ring")
+        outcome = realtime.Outcome(name, True, "not asked for")
+        if seconds:
+            layout, messages = self._layout, len(self._layout.sensors) + 1
+            a_frame = 4 * (layout.n_slopes + layout.n_commands) + _MESSAGE_HEAD * messages
+            capacity = max(math.ceil(seconds * self._rate * a_frame), _LEAST_RING)
+            path = ring_path(self.context.get_domain_id(), self.get_namespace())
+            try:
+                self._ring = RingWriter(path, capacity)
+                outcome = realtime.Outcome(name, True, f"{seconds:g} s ({capacity / 2**20:.0f} MiB, {path.name})")
+            except OSError as error:
+                outcome = realtime.Outcome(name, False, f"{error}; the recorder has to rely on its subscriptions")
+                self.get_logger().warning(str(outcome))
+        hrtc.record_to(self._ring)
+        self._realtime = [other for other in self._realtime if other.name != name] + [outcome]
+
+    def _close_ring(self) -> None:
+        if self._ring is not None:
+            assert self._hrtc is not None
+            self._hrtc.record_to(None)
+            self._ring.close()
+            self._ring = None
 
     def stop_loop(self) -> None:
         """Open the loop, publish flat, end the loop's thread. From every state; twice does no harm."""
@@ -299,6 +335,7 @@ class HrtcNode(LifecycleNode):
         if self._thread is not None:
             self._thread.join()
             self._thread = None
+            self._close_ring()
             self._publish_changes()
 
     def end_loop(self) -> None:

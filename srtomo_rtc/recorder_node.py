@@ -2,6 +2,10 @@
 
 Messages are taken in batches from a node that no executor spins, as serialised bytes, and written by a thread of their
 own: the readers' queues, of a second's messages, bridge a pause of the one, a bounded queue those of the other.
+
+Slopes and commands come from the HRTC's ring in shared memory while there is one. Their subscriptions then stand by:
+nobody takes from their queues, which keep the last second for the moment when the ring is gone, falls silent, or has
+been overrun.
 """
 
 from __future__ import annotations
@@ -35,9 +39,11 @@ from rclpy.utilities import remove_ros_args
 from srtomo_core.bag import BagError, BagWriter
 from srtomo_core.clock import ArrivalClock
 from srtomo_core.layout import Layout
+from srtomo_core.ring import ring_path
 from srtomo_core.system import InstrumentError, System, load_system
 from srtomo_core.wire import COMMAND, EVENT, RECORDER_STATUS, SLOPES, TOPICS, Topic
 from srtomo_rtc.ledger import Ledger
+from srtomo_rtc.ring_source import Recent, RingSource
 
 _HOT_PERIOD = 0.01  # s between visits to the topics of every frame
 _SLOW_VISITS = 10  # the other topics are visited at every tenth of those
@@ -48,6 +54,10 @@ _UNMATCHED_STATUSES = 4  # in a row: after 2 s a publisher in the graph is not m
 _IN_FLIGHT = 0.1  # s from a sensor to here that is no loss when a recording starts or stops in between
 _LAST_MESSAGES = 0.1  # s that messages already sent get to arrive after the order to stop
 _WAITING_BYTES = 256 << 20  # for the disk; beyond it messages wait in the readers' queues
+_OVERLAP = 1.0  # s after a change between ring and subscriptions for which both are taken from
+_REMEMBERED = 10  # queues' worth of messages, which may come by both
+_QUIET = 0.25  # s without a message in the ring after which the subscriptions are looked at too
+_RING_CHANNELS = (SLOPES, COMMAND)
 
 
 _UNRECORDED = "a publisher offers less than reliable (or transient local) delivery, and is not recorded"
@@ -72,6 +82,7 @@ class _Tap:
     message_type: type
     subscription: Any
     clock: ArrivalClock
+    recent: Recent
     recorded: int = 0
     last_sequence: int = 0
     skipped: int = 0
@@ -91,7 +102,6 @@ class _Tap:
             if self.last_sequence and sequence > self.last_sequence + 1:
                 self.skipped += sequence - self.last_sequence - 1
             self.last_sequence = sequence
-            self.recorded += 1
             received = self.clock.start + self.clock.monotonic(info["received_timestamp"])
             yield _Record(received, self, data, info["source_timestamp"], sequence)
 
@@ -152,6 +162,8 @@ class _Scribe(threading.Thread):
 class Recorder:
     """Subscribes to the topics of an instrument, books and records what comes. One thread calls all its methods.
 
+    While an HRTC of this domain and namespace has a ring in shared memory, slopes and commands come from there.
+
     Args:
         bag: to write to; the recorder closes it.
         layout: of the instrument: the sub-apertures that make a frame.
@@ -179,6 +191,12 @@ class Recorder:
             self._tap(topic, max(_LEAST_DEPTH, topic.depth_at(per_second.get(topic, 0.0)))) for topic in topics
         ]
         self._hot = [tap for tap in self._taps if tap.topic in (SLOPES, COMMAND)]
+        self._by_channel = {_RING_CHANNELS.index(tap.topic): tap for tap in self._hot}
+        path = ring_path(self._node.context.get_domain_id(), self._node.get_namespace())
+        self._ring = RingSource(path, time.monotonic_ns())
+        self._ring_wanted = bool(self._hot)
+        self._heard = -math.inf  # when something last came from the ring
+        self._changed = -math.inf  # when ring and subscriptions last took over from each other
         self._unrecorded: list[str] = []
         self._scribe = _Scribe(bag)
         self._scribe.start()
@@ -192,7 +210,7 @@ class Recorder:
         )
         full_name = subscription.topic_name
         self._bag.declare(full_name, topic.type, depth=depth, transient_local=topic.transient_local)
-        return _Tap(topic, full_name, message_type, subscription, self._clock)
+        return _Tap(topic, full_name, message_type, subscription, self._clock, Recent(_REMEMBERED * depth))
 
     def record(self, stop: threading.Event) -> None:
         """Record until ``stop`` is set and what was sent by then is in the bag, then close the bag.
@@ -226,19 +244,47 @@ class Recorder:
             time.sleep(_HOT_PERIOD)
 
     def _drain(self, taps: Sequence[_Tap]) -> bool:
-        batch: list[_Record] = []
+        batch = self._take_ring()
+        since_change = time.monotonic() - self._changed
         for tap in taps:
+            if tap.topic in _RING_CHANNELS and self._ring.attached and since_change > _OVERLAP:
+                continue  # stands by
             with tap.subscription.handle:
                 batch += tap.take()
+        batch.sort(key=itemgetter(0))
+        # a message that came by one way late in the overlap comes by the other after it
+        changing = since_change <= 2 * _OVERLAP
+        batch = [record for record in batch if self._is_news(record) or not changing]
         if not batch:
             return False
-        batch.sort(key=itemgetter(0))
         for record in batch:
             self._book(record)
         self._scribe.give(batch)
         return True
 
+    @staticmethod
+    def _is_news(record: _Record) -> bool:
+        """False for one that has come already, if it can come by two ways."""
+        return record.tap.topic not in _RING_CHANNELS or record.tap.recent.add(record.data)
+
+    def _take_ring(self) -> list[_Record]:
+        before = self._ring.attached, self._ring.overruns
+        messages = self._ring.read(self._ring_wanted)
+        now = time.monotonic()
+        if messages:
+            self._heard = now
+        if before != (self._ring.attached, self._ring.overruns) or (self._ring.attached and now - self._heard > _QUIET):
+            self._changed = now
+        batch = []
+        for channel, arrived, data in messages:
+            tap = self._by_channel.get(channel)
+            if tap is not None:
+                received = self._clock.start + arrived
+                batch.append(_Record(received, tap, data, received, 0))
+        return batch
+
     def _book(self, record: _Record) -> None:
+        record.tap.recorded += 1
         topic = record.tap.topic
         if topic is SLOPES:
             self.ledger.add_slopes(record.data)
@@ -260,6 +306,8 @@ class Recorder:
             if tap.unmatched_statuses == _UNMATCHED_STATUSES:
                 self._unrecorded.append(tap.name)
                 print(f"recorder: {tap.name}: {_UNRECORDED}", file=sys.stderr, flush=True)
+        # the ring holds the commands of one HRTC alone
+        self._ring_wanted = bool(self._hot) and publishers.get(COMMAND, 0) <= 1
         status = RecorderStatus()
         status.header.stamp = self._node.get_clock().now().to_msg()
         status.bag = str(self._bag.path)
@@ -295,6 +343,8 @@ class Recorder:
             "messages": sum(tap.recorded for tap in self._taps),
             "frames": self.ledger.frames,
             "lost": sum(count or 0 for count in lost.values()),
+            "from_ring": self._ring.messages,
+            "overrun": self._ring.overruns,
             "malformed": self.ledger.malformed,
             "of_another_instrument": self.ledger.foreign,
             "unrecorded": self._unrecorded,
@@ -303,7 +353,8 @@ class Recorder:
         }
 
     def close(self) -> None:
-        """Leave the network."""
+        """Leave the network and the ring."""
+        self._ring.close()
         self._node.destroy_node()
 
 
@@ -328,6 +379,9 @@ def table(report: dict[str, Any]) -> str:
     if report["removed_files"]:
         removed = f"the oldest {report['removed_files']} files, {report['removed_bytes'] / 1e6:.1f} MB"
         lines.append(f"{removed}, were removed to stay within the limit")
+    if report["from_ring"]:
+        overrun = f", {report['overrun']} were overwritten there first" if report["overrun"] else ""
+        lines.append(f"{report['from_ring']} slopes and commands came from the HRTC's memory{overrun}")
     if report["malformed"]:
         lines.append(f"{report['malformed']} malformed messages were recorded as they came")
     if report["of_another_instrument"]:

@@ -1,6 +1,7 @@
 /* The frame path: serialised slopes in, serialised commands out. No allocation once made, no lock, no interpreter.
  *
- * law.c holds the control law, gate.c the frame gate around it; ros.c drives both from rcl. What they do is described
+ * law.c holds the control law, gate.c the frame gate around it, ring.c what both leave for the recorder; ros.c drives
+ * them from rcl. What they do is described
  * where Python wraps them: srtomo_rtc/loop.py and srtomo_rtc/hrtc.py. Structures that Python reads are mirrored in
  * srtomo_rtc/native.py, which compares srt_abi() with its own sum.
  *
@@ -129,6 +130,21 @@ static inline float *srt_loop_slopes(const srt_loop *loop, int64_t frame, uint32
 /* x0 x1 .. y0 y1 .. (anywhere in memory) to x0 y0 x1 y1 .. */
 void srt_interleave(const void *xy, size_t n, float *out);
 
+/* -- ring.c ------------------------------------------------------------------------------------------------------- */
+
+/* A ring in shared memory, made, locked and described in srtomo_core/ring.py. */
+typedef struct {
+    uint8_t *memory;           /* the whole file; NULL: there is none, and nothing is written */
+    uint64_t capacity;         /* of the data, bytes */
+    int64_t ahead;             /* what the records' times are more than the monotonic clock, ns */
+    uint64_t position, number; /* of the next record */
+} srt_ring;
+
+enum srt_channel { SRT_SLOPES, SRT_COMMANDS };
+
+/* A message larger than half the ring is left out, and counted by readers as lost. */
+void srt_ring_write(srt_ring *ring, uint32_t channel, int64_t now_ns, const uint8_t *message, size_t size);
+
 /* -- gate.c ------------------------------------------------------------------------------------------------------- */
 
 /* Names as in msgs_schema/msg/HrtcStatus. */
@@ -184,6 +200,7 @@ typedef struct {
     size_t largest_message; /* a SlopeFrame with every sensor, bytes; its frame_id takes at most 256 */
     srt_publish publish;
     void *publish_context;
+    srt_ring ring;    /* every message that is offered, and every command that went out; set before the loop starts */
     int32_t failure;  /* the first nonzero that publish returned since this was set to 0 */
     atomic_int stop;  /* for srt_run */
 } srt_gate;

@@ -343,9 +343,12 @@ static void answer_next(gate *g, int verdict)
         verdict = srt_loop_hold(loop, verdict);
     size_t size = write_command(g, e, frame, program, since_ns);
     int failure = g->shared.publish ? g->shared.publish(g->shared.publish_context, g->command, size) : 0;
-    if (failure && !g->shared.failure)
+    int64_t out_ns = srt_now();
+    if (!failure)
+        srt_ring_write(&g->shared.ring, SRT_COMMANDS, out_ns, g->command, size);
+    else if (!g->shared.failure)
         g->shared.failure = failure;
-    srt_latency_add(&g->shared.latency, srt_now() - since_ns);
+    srt_latency_add(&g->shared.latency, out_ns - since_ns);
     counters->commands++;
     counters->clipped += loop->n_clipped;
     switch (verdict) {
@@ -496,6 +499,7 @@ int64_t srt_gate_offer(srt_gate *shared, const uint8_t *message, size_t size, in
     gate *g = (gate *)shared;
     srt_counters *counters = &shared->counters;
     const srt_loop *loop = shared->loop;
+    srt_ring_write(&shared->ring, SRT_SLOPES, now_ns, message, size);
     slope_frame s;
     if (!read_slopes(message, size, &s)) {
         counters->dropped_malformed++;
