@@ -101,19 +101,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
         os.environ.setdefault(variable, "1")
     if not any(variable in os.environ for variable in _LOCAL):
         os.environ.update(_LOCAL)
-    module = importlib.import_module(f"srtomo_ops.commands.{command.module or command.name}")
-    from srtomo_ops.options import writable_file
-
-    parser = _Parser(
-        prog=f"srtomo {command.name}",
-        description=command.help[0].upper() + command.help[1:] + ".",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        epilog=module.EXAMPLE.replace("COMMAND", command.name),
-    )
-    module.configure(parser)
-    options = parser.parse_args(words[1:])
-    options.command = command.name
     try:
+        module = importlib.import_module(f"srtomo_ops.commands.{command.module or command.name}")
+        from srtomo_ops.options import writable_file
+
+        parser = _Parser(
+            prog=f"srtomo {command.name}",
+            description=command.help[0].upper() + command.help[1:] + ".",
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+            epilog=module.EXAMPLE.replace("COMMAND", command.name),
+        )
+        module.configure(parser)
+        options = parser.parse_args(words[1:])
+        options.command = command.name
         if getattr(options, "json", None) is not None:
             writable_file(options.json)  # before any work
         return int(module.main(options))
@@ -127,6 +127,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(
             f"srtomo {command.name}: needs ROS 2 ({error.name} is missing): pip install 'srtomo[ros]'", file=sys.stderr
         )
+        return 2
+    except ImportError as error:
+        if error.name != "srtomo_rtc.native":
+            raise
+        print(f"srtomo {command.name}: {error}", file=sys.stderr)
         return 2
     except OSError as error:
         if error.filename is None or os.environ.get("SRTOMO_TRACEBACK"):

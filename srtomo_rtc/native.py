@@ -252,13 +252,15 @@ def _load(name: str, functions: dict[str, tuple[Any, tuple[Any, ...]]]) -> ctype
             getattr(library, function).restype = result
             getattr(library, function).argtypes = arguments
     except (OSError, AttributeError) as error:
-        raise ImportError(f"{path}: {error}; install srtomo again") from None
+        raise ImportError(f"{path}: {error}; install srtomo again", name=__name__) from None
     return library
 
 
 def _must_agree(library: int, here: int) -> None:
     if library != here:
-        raise ImportError("the compiled frame path is of another version than its Python: install srtomo again")
+        raise ImportError(
+            "the compiled frame path is of another version than its Python: install srtomo again", name=__name__
+        )
 
 
 lib: Any = _load("libsrtomo_frame.so", _FUNCTIONS)

@@ -239,6 +239,15 @@ def test_text_with_brackets_stays_text() -> None:
         assert quoted(given, defaults) == passed
 
 
+def test_a_frame_path_of_another_version_is_one_line(monkeypatch: pytest.MonkeyPatch, capsys) -> None:
+    def refuse(name: str) -> None:
+        raise ImportError("the compiled frame path: install srtomo again", name="srtomo_rtc.native")
+
+    monkeypatch.setattr(cli.importlib, "import_module", refuse)
+    assert cli.main(["systems"]) == 2
+    assert capsys.readouterr().err == "srtomo systems: the compiled frame path: install srtomo again\n"
+
+
 def test_a_node_lists_its_parameters_and_refuses_others() -> None:
     pytest.importorskip("rclpy")
     listed = _apart("hrtc", "mini", "--parameters")
