@@ -217,7 +217,8 @@ class _Noise:
         correlated = []
         for (own, mine), (_, theirs) in zip(self.correlated, other.correlated, strict=True):
             a, b, both = (np.prod(np.split(s[own], 2), axis=0) for s in (self.sigma, other.sigma, sigma))
-            correlated.append((own, ((1 - share) * mine * a + share * theirs * b) / both))
+            between = ((1 - share) * mine * a + share * theirs * b) / both
+            correlated.append((own, np.asarray(between, np.float32)))
         return _Noise(sigma, correlated)
 
 

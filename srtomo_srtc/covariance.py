@@ -52,6 +52,11 @@ class Sightline:
         return Sightline(self.nodes.only(layers), self.gradient, self.seen and self.seen.only(layers))
 
 
+def _span(values: Sequence[Array]) -> Array:
+    """(n_layers,) from the smallest to the largest, of several (n_layers, n_points)."""
+    return np.asarray(np.max([v.max(axis=1) for v in values], axis=0) - np.min([v.min(axis=1) for v in values], axis=0))
+
+
 @dataclass(frozen=True)
 class Turbulence:
     """A profile, and its covariance tabulated as far as a set of footprints needs it."""
@@ -62,12 +67,7 @@ class Turbulence:
     @classmethod
     def covering(cls, profile: Profile, points: Sequence[Footprints]) -> Turbulence:
         """Tabulate up to the largest separation between any two of ``points`` on a layer."""
-        x_span, y_span = (
-            np.max([values.max(axis=1) for values in axis], axis=0)
-            - np.min([values.min(axis=1) for values in axis], axis=0)
-            for axis in ([p.x for p in points], [p.y for p in points])
-        )
-        reach = float(np.hypot(x_span, y_span).max())
+        reach = float(np.hypot(_span([p.x for p in points]), _span([p.y for p in points])).max())
         return cls(profile.fractions, CovarianceTable.build(profile.r0, profile.outer_scale, reach))
 
 

@@ -57,7 +57,7 @@ def independent_frames(
     def through(vectors: NDArray[np.float32]) -> list[NDArray[np.float32]]:
         """Each parameter's M, times vectors (n, n_vectors)."""
         seen = A @ vectors
-        return [A @ (influence @ seen) for influence in influences]
+        return [np.asarray(A @ (influence @ seen), np.float32) for influence in influences]
 
     first = through(Z)
 

@@ -259,13 +259,14 @@ class Telemetry:
             raise ValueError(f"telemetry: expected at least 2 frames to count, got {n_frames}")
         squares = np.sum([block.squares for block in blocks], axis=0)
         pooled = _moments(squares, np.sum([block.sum for block in blocks], axis=0), n_frames)
-        lagged, lagged_frames = {}, {}
+        lagged: dict[int, NDArray[np.float32]] = {}
+        lagged_frames: dict[int, int] = {}
         for lag in self._lags:
             pairs = sum(block.lagged_frames[lag] for block in blocks)
             if pairs:
                 lagged_frames[lag] = pairs
-                lagged[lag] = np.sum([block.lagged[lag] for block in blocks], axis=0) / np.float32(pairs)
-                lagged[lag] -= np.outer(pooled.mean, pooled.mean).astype(np.float32)
+                moment = np.sum([block.lagged[lag] for block in blocks], axis=0) / np.float32(pairs)
+                lagged[lag] = np.asarray(moment - np.outer(pooled.mean, pooled.mean), np.float32)
         first, last = blocks[0].first_frame, blocks[-1].last_frame
         return Statistics(
             pooled.covariance,
