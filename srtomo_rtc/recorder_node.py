@@ -239,9 +239,11 @@ class Recorder:
                 self._publish_status()
                 status_at = time.monotonic() + _STATUS_PERIOD
             time.sleep(_HOT_PERIOD)
+        # not until nothing comes any more: the loop may run on
         deadline = time.monotonic() + _LAST_MESSAGES
-        while self._scribe.error is None and (self._drain(self._taps) or time.monotonic() < deadline):
+        while self._scribe.error is None and time.monotonic() < deadline:
             time.sleep(_HOT_PERIOD)
+            self._drain(self._taps)
 
     def _drain(self, taps: Sequence[_Tap]) -> bool:
         batch = self._take_ring()
