@@ -11,8 +11,9 @@ import tempfile
 import time
 from pathlib import Path
 
-os.environ.update({"OPENBLAS_NUM_THREADS": "1", "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"})
-os.environ["FASTDDS_BUILTIN_TRANSPORTS"] = "SHM"
+from srtomo_ops.cli import LOCAL
+
+os.environ.update({"OPENBLAS_NUM_THREADS": "1", **LOCAL})
 
 import numpy as np
 import rclpy

@@ -8,6 +8,7 @@ import os
 import sys
 from collections.abc import Sequence
 from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
 from typing import NamedTuple, NoReturn
 
 
@@ -50,7 +51,11 @@ GROUPS: dict[str, tuple[Command, ...]] = {
 
 # Nodes talk over shared memory alone unless the user says otherwise: ROS 2's discovery has no authentication, and even
 # its range LOCALHOST binds sockets to every interface.
-_LOCAL = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "FASTDDS_BUILTIN_TRANSPORTS": "SHM"}
+LOCAL = {
+    "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+    "FASTDDS_BUILTIN_TRANSPORTS": "SHM",
+    "FASTRTPS_DEFAULT_PROFILES_FILE": str(Path(__file__).with_name("fastdds.xml")),
+}
 
 _THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 
@@ -99,8 +104,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     # one BLAS thread beats two on busy cores, and has to be asked for before numpy loads
     for variable in _THREADS:
         os.environ.setdefault(variable, "1")
-    if not any(variable in os.environ for variable in _LOCAL):
-        os.environ.update(_LOCAL)
+    if not any(variable in os.environ for variable in LOCAL):
+        os.environ.update(LOCAL)
     try:
         module = importlib.import_module(f"srtomo_ops.commands.{command.module or command.name}")
         from srtomo_ops.options import writable_file

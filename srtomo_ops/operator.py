@@ -8,7 +8,7 @@ from functools import partial
 from typing import Any
 
 from lifecycle_msgs.msg import Transition
-from lifecycle_msgs.srv import ChangeState
+from lifecycle_msgs.srv import ChangeState, GetState
 from msgs_schema.msg import HrtcStatus, RecorderStatus, SimStatus
 from msgs_schema.srv import ChangeSky, PublishReconstructor, SwapReconstructor
 from rclpy.client import Client
@@ -27,8 +27,17 @@ TRANSITIONS = {
 }
 
 
+TRANSITION = 15.0  # s that one may take before the state is looked at, and then again
+
+REACHED = {"configure": "inactive", "activate": "active", "deactivate": "inactive", "cleanup": "unconfigured"}
+
+
 class OperatorError(ValueError):
     """A node that does not answer, or refuses; one line with its reason."""
+
+
+class NoAnswer(OperatorError):
+    """It was asked, and has not answered in time."""
 
 
 class Operator(Node):
@@ -49,6 +58,7 @@ class Operator(Node):
         self.hrtc: HrtcStatus | None = None
         self.recorder: RecorderStatus | None = None
         self.sim: SimStatus | None = None
+        self._asked: dict[str, Client] = {}
         for topic, kind, attribute in (
             (wire.STATUS, HrtcStatus, "hrtc"),
             (wire.RECORDER_STATUS, RecorderStatus, "recorder"),
@@ -66,31 +76,42 @@ class Operator(Node):
         """Call a service.
 
         Raises:
-            OperatorError: it is not there, or does not answer in time.
+            OperatorError: it is not there; NoAnswer: it does not answer in time.
         """
-        client = self.create_client(kind, service)
-        try:
-            return self.ask(client, request, timeout)
-        finally:
-            self.destroy_client(client)
+        client = self._asked.get(service)
+        if client is None:
+            client = self.create_client(kind, service)
+            try:
+                self._wait_for(client)
+            except OperatorError:
+                self.destroy_client(client)
+                raise
+            # rmw_fastrtps drops an answer when it has not found the asker's reader yet, and tells nobody
+            # (https://github.com/ros2/rmw_fastrtps/issues/842): the server gets a moment to find this client.
+            self.spin(0.1)
+            self._asked[service] = client
+        return self.ask(client, request, timeout)
+
+    def _wait_for(self, client: Client) -> None:
+        end = time.monotonic() + self._patience
+        while not client.service_is_ready():
+            if time.monotonic() > end:
+                name = client.service_name
+                raise OperatorError(f"{name}: nobody offers this service in namespace {self.get_namespace()}")
+            self.spin(0.05)
 
     def ask(self, client: Client, request: Any, timeout: float = 10.0) -> Any:
         """Call a service through a client that is there already: for many calls in a short time.
 
         Raises:
-            OperatorError: the service is not there, or does not answer in time.
+            OperatorError: the service is not there; NoAnswer: it does not answer in time.
         """
-        service = client.service_name
-        end = time.monotonic() + self._patience
-        while not client.service_is_ready():
-            if time.monotonic() > end:
-                raise OperatorError(f"{service}: nobody offers this service in namespace {self.get_namespace()}")
-            self.spin(0.05)
+        self._wait_for(client)
         end = time.monotonic() + timeout
         future = client.call_async(request)
         while not future.done():
             if time.monotonic() > end:
-                raise OperatorError(f"{service}: no answer in {timeout:g} s")
+                raise NoAnswer(f"{client.service_name}: no answer in {timeout:g} s")
             self._executor.spin_once(timeout_sec=0.05)
         return future.result()
 
@@ -110,10 +131,25 @@ class Operator(Node):
         """
         # by the label rclpy finds out whether there is such a transition now; an id alone it would stumble over
         request = ChangeState.Request(transition=Transition(id=TRANSITIONS[name], label=name))
-        if not self.call(ChangeState, "hrtc/change_state", request, timeout=30.0).success:
+        try:
+            success = self.call(ChangeState, "hrtc/change_state", request, timeout=TRANSITION).success
+        except NoAnswer:  # it was lost, or this takes long: the state tells
+            end = time.monotonic() + TRANSITION
+            while (state := self.state()) != REACHED[name] and time.monotonic() < end:
+                self.spin(0.2)
+            success = state == REACHED[name]
+        if not success:
             self.spin(0.3)
             state = f"the HRTC is {self.hrtc.state}" if self.hrtc is not None else "refused"
             raise OperatorError(f"{name}: {state}; if that allows it, the HRTC's log says why it failed")
+
+    def state(self) -> str:
+        """The HRTC's lifecycle state.
+
+        Raises:
+            OperatorError: it does not answer.
+        """
+        return str(self.call(GetState, "hrtc/get_state", GetState.Request()).current_state.label)
 
     def close_loop(self, closed: bool) -> None:
         """Close or open the loop.

@@ -14,6 +14,8 @@ from pathlib import Path
 
 import pytest
 
+from srtomo_ops.cli import LOCAL
+
 NEEDS_ROS = "needs rclpy: install srtomo with its extra, pip install '.[ros]', or source ROS 2 Jazzy"
 
 
@@ -98,8 +100,8 @@ def _own_domain() -> Iterator[int]:
 
     with domain_id() as number, pytest.MonkeyPatch.context() as patch:
         patch.setenv("ROS_DOMAIN_ID", str(number))
-        patch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-        patch.setenv("FASTDDS_BUILTIN_TRANSPORTS", "SHM")
+        for variable, value in LOCAL.items():
+            patch.setenv(variable, value)
         yield number
 
 

@@ -22,7 +22,7 @@ rclpy = pytest.importorskip("rclpy", reason="needs rclpy: pip install '.[ros]', 
 
 from diagnostic_msgs.msg import DiagnosticArray
 from lifecycle_msgs.msg import Transition
-from lifecycle_msgs.srv import ChangeState, GetState
+from lifecycle_msgs.srv import ChangeState
 from msgs_schema.msg import DmCommand, HrtcEvent, SlopeFrame
 from msgs_schema.msg import Reconstructor as ReconstructorMsg
 from msgs_schema.msg import ReconstructorBlock as ReconstructorBlockMsg
@@ -569,8 +569,7 @@ def test_a_signal_in_every_state(start, ros, state, signal):
         else:
             request = ChangeState.Request(transition=transition)
             assert operator.call(ChangeState, "hrtc/change_state", request).success
-    reached = operator.call(GetState, "hrtc/get_state", GetState.Request()).current_state.label
-    assert reached == {"stopped": "inactive", "cleaned up": "unconfigured"}.get(state, state)
+    assert operator.state() == {"stopped": "inactive", "cleaned up": "unconfigured"}.get(state, state)
     assert_ends(process, signal)
     operator.destroy_node()
 

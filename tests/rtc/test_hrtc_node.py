@@ -25,7 +25,7 @@ from srtomo_sim.sky import prepare
 rclpy = pytest.importorskip("rclpy", reason="needs rclpy: pip install '.[ros]', or source ROS 2 Jazzy")
 
 from lifecycle_msgs.msg import Transition
-from lifecycle_msgs.srv import ChangeState, GetState
+from lifecycle_msgs.srv import ChangeState
 from msgs_schema.msg import DmCommand, HrtcEvent
 from msgs_schema.srv import PublishReconstructor, SetStaticShape, SwapReconstructor
 from rcl_interfaces.srv import SetParameters
@@ -105,10 +105,6 @@ def answers(operator: Operator) -> bool:
         operator.call(PublishReconstructor, "srtc/publish", PublishReconstructor.Request(label="?"), timeout=0.5)
         return True
     return False
-
-
-def state_of(operator: Operator) -> str:
-    return operator.call(GetState, "hrtc/get_state", GetState.Request()).current_state.label
 
 
 @pytest.fixture(scope="module")
@@ -405,7 +401,7 @@ def test_deactivating_leaves_the_mirror_flat(finished):
     assert loop.first_frame == FRAMES
     operator.transition("activate")
     operator.close_loop(True)
-    assert state_of(operator) == "active"
+    assert operator.state() == "active"
 
 
 def test_sigterm_while_active_and_closed(finished):
@@ -460,13 +456,13 @@ def test_a_missing_or_wrong_file_fails_in_one_line_and_the_node_stays_usable(ros
     with pytest.raises(OperatorError, match="configure"):
         operator.transition("configure")
     process.wait_for("made for another instrument")
-    assert state_of(operator) == "unconfigured"
+    assert operator.state() == "unconfigured"
     assert sum("[ERROR]" in line for line in process.output.splitlines()) == 4
     assert "Traceback" not in process.output
     save_interaction_matrix(path, interaction_matrix(SYSTEM, LAYOUT), LAYOUT.fingerprint, {})
     operator.transition("configure")
     operator.transition("activate")
-    assert state_of(operator) == "active"
+    assert operator.state() == "active"
     wait_until(operator, lambda: operator.count_subscribers(wire.SLOPES.name) == 1)  # none was left over
     assert process.terminate() == 0, process.output  # active, open
     operator.destroy_node()
@@ -494,7 +490,7 @@ def test_round_and_round_the_lifecycle(ros, others):
 
 def test_sigterm_before_anything_was_configured(ros, others):
     operator = Operator("fresh")
-    assert state_of(operator) == "unconfigured"
+    assert operator.state() == "unconfigured"
     started = time.monotonic()
     assert others.fresh.terminate() == 0, others.fresh.output
     assert time.monotonic() - started < 5
