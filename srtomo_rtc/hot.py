@@ -43,6 +43,7 @@ class HotEndpoints:
 
     Attributes:
         outcome: how the loop's thread waits, takes and publishes, and why so.
+        poll_ns: how long it looks for slopes without sleeping after some came.
         received: (n, 2) for measurements: frame and time (ns, the system's clock) at which the middleware received each
             of the first n messages that fit; n is ``room``. Only out of the interpreter.
     """
@@ -53,7 +54,8 @@ class HotEndpoints:
         cores = len(os.sched_getaffinity(0))
         polling = waiting == "polling" or (waiting == "auto" and cores >= _CORES_TO_POLL)
         self._library: Any = None
-        self._ros = native.Ros(poll_ns=_POLL if polling else 0)
+        self.poll_ns = _POLL if polling else 0
+        self._ros = native.Ros(poll_ns=self.poll_ns)
         how = f"{'polling' if polling else 'blocking'} ({waiting}, {cores} cores)"
         if not compiled:
             self.outcome = Outcome("frame path", True, "rclpy, blocking (asked for)")

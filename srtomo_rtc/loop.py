@@ -39,6 +39,7 @@ from numpy.typing import NDArray
 from srtomo_core.layout import Layout
 from srtomo_core.reconstructor import Reconstructor
 from srtomo_rtc import native
+from srtomo_rtc.crew import Crew
 from srtomo_rtc.native import lib
 from srtomo_rtc.vmm import huge_zeros, multiply, quantise, rows_of, tiled, tiles_shape, untiled
 
@@ -437,6 +438,11 @@ class Loop:
     def request(self, closed: bool) -> None:
         """Close or open the loop from the next frame that is prepared: one flag is stored."""
         lib.srt_loop_request(self._pointer, closed)
+
+    def use(self, crew: Crew | None) -> None:
+        """Share the products with a crew, which must stay open until this was called again; None: with nobody. While
+        the loop's thread does not run."""
+        lib.srt_loop_use(self._pointer, None if crew is None else crew.pointer)
 
     # -- from the loop's thread -------------------------------------------------------------------------------------
 

@@ -11,6 +11,7 @@ import sysconfig
 from ctypes import (
     POINTER,
     Structure,
+    c_bool,
     c_char_p,
     c_float,
     c_int,
@@ -34,6 +35,21 @@ BINS = 384
 
 PUBLISH = ctypes.CFUNCTYPE(c_int, c_void_p, c_void_p, c_size_t)
 """(context, message, bytes) -> 0, or else it did not go out."""
+
+
+class Product(Structure):
+    """``srt_product``."""
+
+    _fields_ = [
+        ("tiles", c_void_p),
+        ("n_tiles", c_size_t),
+        ("n_columns", c_size_t),
+        ("first", c_size_t),
+        ("last", c_size_t),
+        ("vector", c_void_p),
+        ("sums", c_void_p),
+        ("int16", c_bool),
+    ]
 
 
 class Matrices(Structure):
@@ -206,9 +222,12 @@ class Ros(Structure):
 _LOOP, _GATE, _WORDS = POINTER(Loop), POINTER(Gate), POINTER(c_uint32)
 
 _FUNCTIONS: dict[str, tuple[Any, tuple[Any, ...]]] = {
-    "srt_accumulate": (None, (c_void_p, c_size_t, c_size_t, c_size_t, c_size_t, c_void_p, c_void_p)),
-    "srt_accumulate_int16": (None, (c_void_p, c_size_t, c_size_t, c_size_t, c_size_t, c_void_p, c_void_p)),
     "srt_instructions": (c_char_p, ()),
+    "srt_crew_new": (c_void_p, (c_uint32, c_int64, c_size_t)),
+    "srt_crew_free": (None, (c_void_p,)),
+    "srt_crew_thread": (c_int32, (c_void_p, c_uint32)),
+    "srt_crew_multiply": (None, (c_void_p, POINTER(Product))),
+    "srt_loop_use": (None, (_LOOP, c_void_p)),
     "srt_interleave": (None, (c_void_p, c_size_t, c_void_p)),
     "srt_loop_new": (_LOOP, (_WORDS, c_uint32, c_uint32, c_float, c_uint32)),
     "srt_loop_free": (None, (_LOOP,)),
@@ -290,4 +309,4 @@ def view(owner: object, address: int, shape: tuple[int, ...], kind: str = "<f4")
     return np.asarray(_Memory(owner, address, shape, kind))
 
 
-_must_agree(lib.srt_abi(), sum(map(ctypes.sizeof, (Matrices, Program, Loop, Change, Snapshot, Gate))))
+_must_agree(lib.srt_abi(), sum(map(ctypes.sizeof, (Product, Matrices, Program, Loop, Change, Snapshot, Gate))))

@@ -48,6 +48,7 @@ from srtomo_core.layout import Layout
 from srtomo_core.reconstructor import Reconstructor, ReconstructorError, load_interaction_matrix
 from srtomo_core.ring import RingWriter, ring_path
 from srtomo_core.system import InstrumentError, load_system
+from srtomo_rtc.crew import MAX_THREADS, SPIN_NS, Crew, candidates, choose
 from srtomo_rtc.events import EventKind, change_fields, event_fields, state_fields
 from srtomo_rtc.hot import HotEndpoints
 from srtomo_rtc.hrtc import Hrtc, Snapshot
@@ -94,9 +95,16 @@ _PARAMETERS: tuple[tuple[str, Any, ParameterDescriptor], ...] = (
         _integer("exposures that a reconstructor may use; n above 1 take n+1 times the memory", 1, MAX_EPOCHS, True),
     ),
     ("frame_path", "compiled", _read_only("how slopes come in and commands go out: compiled, or rclpy")),
-    ("kernel", "float32", _read_only("matrix-vector kernel: float32, or int16, half the memory traffic")),
+    (
+        "kernel",
+        "auto",
+        _read_only(
+            "matrix-vector kernel: float32; int16, half the memory traffic; auto: float32, others only measured"
+        ),
+    ),
+    ("threads", 0, _integer("that share a product, the loop's included; 0: by measurement", 0, MAX_THREADS, True)),
     ("waiting", "auto", _read_only("how the compiled path waits: blocking, polling, or auto: by the cores there are")),
-    ("cores", "", _read_only("cores that the loop's thread is kept on, as 2,3; empty: any")),
+    ("cores", "", _read_only("cores of the loop's thread, as 2,3; with several threads one each; empty: any")),
     ("fifo_priority", 0, _integer("SCHED_FIFO priority of the process; 0: normal scheduling", 0, 99, True)),
     ("deadline", 0.0, _read_only("latency above which a frame is a miss, s; 0: the loop's delay less one exposure")),
     ("ring", 10.0, _number("s of messages kept in shared memory for the recorder; 0: none", 0.0, 600.0, True)),
@@ -161,6 +169,7 @@ class HrtcNode(LifecycleNode):
         self._hrtc: Hrtc | None = None
         self._swap: Swap | None = None
         self._hot: HotEndpoints | None = None
+        self._crew: Crew | None = None
         self._ring: RingWriter | None = None
         self._thread: threading.Thread | None = None
         self._lifecycle = "unconfigured"
@@ -230,9 +239,10 @@ class HrtcNode(LifecycleNode):
             command_limit=self._value("command_limit"),
             fault_budget=self._value("fault_budget"),
         )
-        kernel = self._value("kernel")
-        if kernel not in KERNELS:
-            raise ValueError(f"parameter kernel: expected {' or '.join(KERNELS)}, got {kernel}")
+        asked = self._value("kernel")
+        if asked not in ("auto", *KERNELS):
+            raise ValueError(f"parameter kernel: expected auto or {' or '.join(KERNELS)}, got {asked}")
+        kernel = "float32" if asked == "auto" else asked
         try:
             self._cores = [int(word) for word in self._value("cores").split(",") if word]
         except ValueError:
@@ -259,6 +269,7 @@ class HrtcNode(LifecycleNode):
         )
         self._hot, self._swap, self._layout, self._rate = hot, swap, layout, loop.rate
         try:
+            multiplying = self._start_crew(swap, kernel, others=asked == "auto")
             self._load_first()
         except ValueError:
             self._clean_up()
@@ -266,15 +277,37 @@ class HrtcNode(LifecycleNode):
         self._realtime = [
             _BLAS,
             hot.outcome,
-            realtime.Outcome("kernel", True, f"{KERNELS[kernel]}, {instructions()}"),
+            multiplying,
             realtime.lock_memory(),
             realtime.huge_pages(),
             realtime.quiet_interpreter(),
             realtime.fifo_priority(self._value("fifo_priority")),
+            *self._pin_helpers(),
         ]
         # a manifest and blocks may have come while there was no memory for them
         if self._manifest is not None:
             self._begin(self._manifest)
+
+    def _start_crew(self, swap: Swap, kernel: str, others: bool) -> realtime.Outcome:
+        """Have the loop's products shared by as many threads as are asked for, or pay; what was measured."""
+        assert self._hrtc is not None and self._hot is not None
+        threads, available = self._value("threads"), len(self._cores or os.sched_getaffinity(0))
+        if threads > available:
+            raise ValueError(f"parameter threads: expected at most {available}, the cores there are, got {threads}")
+        # one core is for the system and the middleware, unless cores were set aside
+        tried = [threads] if threads else candidates(available if self._cores else available - 1)
+        with realtime.kept_on(self._cores):
+            choice = choose(swap.scratch(), tried, 1 / self._rate, others)
+        self._crew = Crew(choice.threads, max(SPIN_NS, self._hot.poll_ns))
+        self._hrtc.loop.use(self._crew)
+        detail = f"{KERNELS[kernel]}, {instructions()}, {choice.threads} threads ({'asked for' if threads else 'auto'})"
+        outcome = realtime.Outcome("kernel", True, f"{detail}; measured: {', '.join(map(str, choice.timings))}")
+        self.get_logger().info(str(outcome))
+        return outcome
+
+    def _pin_helpers(self) -> list[realtime.Outcome]:
+        helpers = self._crew.helpers if self._crew is not None else ()
+        return [realtime.pin_helpers(helpers, self._cores)] if helpers else []
 
     def _load_first(self) -> None:
         """Start from the file of parameter ``reconstructor``, or else from the last one committed."""
@@ -350,13 +383,22 @@ class HrtcNode(LifecycleNode):
         self._worker.submit(lambda: None).result()
         if self._hot is not None:
             self._hot.destroy()
+        self._end_crew()
         self._hot = self._hrtc = self._swap = None
         self._kinds.clear()
         self._taken_up = (None, 0)
 
+    def _end_crew(self) -> None:
+        if self._crew is not None:
+            assert self._hrtc is not None
+            self._hrtc.loop.use(None)
+            self._crew.close()
+            self._crew = None
+
     def close(self) -> None:
         """Stop everything, in an order that never publishes into what is gone."""
         self.stop_loop()
+        self._end_crew()
         self._worker.shutdown(wait=True)
         if self._hot is not None:
             self._hot.destroy()
@@ -371,7 +413,8 @@ class HrtcNode(LifecycleNode):
         hrtc, hot = self._hrtc, self._hot
         assert hrtc is not None and hot is not None
         try:
-            pinned = realtime.pin_thread(self._cores)
+            several = self._crew is not None and self._crew.threads > 1
+            pinned = realtime.pin_thread(self._cores[:1] if several else self._cores)
             self._realtime = [outcome for outcome in self._realtime if outcome.name != pinned.name] + [pinned]
             hot.run(hrtc)
         except Exception:

@@ -10,7 +10,8 @@ import gc
 import os
 import resource
 import sys
-from collections.abc import Collection
+from collections.abc import Collection, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -74,15 +75,34 @@ def huge_pages() -> Outcome:
     return Outcome("huge pages", False, reason)
 
 
-def pin_thread(cores: Collection[int]) -> Outcome:
-    """Keep the calling thread on some cores; none: leave it as it is."""
-    name = "affinity of the loop"
+def pin_thread(cores: Collection[int], thread: int = 0, name: str = "affinity of the loop") -> Outcome:
+    """Keep a thread, 0 for the calling one, on some cores; none: leave it as it is."""
     try:
         if cores:
-            os.sched_setaffinity(0, cores)
+            os.sched_setaffinity(thread, cores)
+        return Outcome(name, True, "cores " + ",".join(map(str, sorted(os.sched_getaffinity(thread)))))
     except (OSError, ValueError) as error:
         return Outcome(name, False, str(error))
-    return Outcome(name, True, "cores " + ",".join(map(str, sorted(os.sched_getaffinity(0)))))
+
+
+def pin_helpers(helpers: Sequence[int], cores: Sequence[int]) -> Outcome:
+    """Keep each helper thread on the core after the one before; the loop's own is the first. None: leave them."""
+    name = "affinity of the helpers"
+    each = [pin_thread(cores[i : i + 1], helper, name) for i, helper in enumerate(helpers, start=1)]
+    refused = [outcome for outcome in each if not outcome.applied]
+    return refused[0] if refused else Outcome(name, True, ", ".join(outcome.detail for outcome in each))
+
+
+@contextmanager
+def kept_on(cores: Collection[int]) -> Iterator[None]:
+    """Keep the calling thread, and those that it starts meanwhile, on some cores, if that can be; none: as they are."""
+    before = os.sched_getaffinity(0)
+    with suppress(OSError, ValueError):
+        os.sched_setaffinity(0, cores or before)
+    try:
+        yield
+    finally:
+        os.sched_setaffinity(0, before)
 
 
 def fifo_priority(priority: int) -> Outcome:

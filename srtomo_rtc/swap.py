@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -387,12 +388,20 @@ class Swap:
         result = check(reconstructor, self._layout, self._G_cal, self._sees_tip_tilt, self._sees_focus)
         if self._kernel == "int16":
             self._check_int16(reconstructor)
-        in_use = {id(held.slot) for held in (self.active, self.previous) if held is not None}
-        slot = next(slot for slot in self._slots if id(slot) not in in_use)
+        slot = self._free()
         slot.fill(reconstructor)
         Program(slot, self.settings).warm()
         self.staged = Held(slot, result, reconstructor)
         return self.staged
+
+    def _free(self) -> Slot:
+        in_use = {id(held.slot) for held in (self.active, self.previous) if held is not None}
+        return next(slot for slot in self._slots if id(slot) not in in_use)
+
+    def scratch(self) -> tuple[NDArray[Any], ...]:
+        """R's tiles of a slot that the loop does not use, to measure with; what was staged in it is lost."""
+        self.staged = None
+        return self._free().epochs[0].R_tiles
 
     def _check_epochs(self, n_epochs: int) -> None:
         if not 1 <= n_epochs <= self._max_epochs:

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
+from srtomo_rtc import native
 from srtomo_rtc.native import lib
 
 Floats = NDArray[np.float32]
@@ -112,10 +113,17 @@ def accumulate(tiles: NDArray[Any], vector: Floats, sums: Floats, first: int = 0
         vector: (n_columns,) C-contiguous.
         sums: C-contiguous, of at least as many rows as the tiles have.
     """
+    lib.srt_crew_multiply(None, product_of(tiles, vector, sums, first, last))
+
+
+def product_of(
+    tiles: NDArray[Any], vector: Floats, sums: Floats, first: int = 0, last: int | None = None
+) -> native.Product:
+    """:func:`accumulate`'s arguments for the library; they must stay while it is used."""
     n_tiles, n_columns, _ = tiles.shape
-    function = lib.srt_accumulate if tiles.dtype == np.float32 else lib.srt_accumulate_int16
     last = n_columns if last is None else last
-    function(tiles.ctypes.data, n_tiles, n_columns, first, last, vector.ctypes.data, sums.ctypes.data)
+    where = tiles.ctypes.data, vector.ctypes.data, sums.ctypes.data
+    return native.Product(where[0], n_tiles, n_columns, first, last, *where[1:], tiles.dtype == np.int16)
 
 
 def multiply(tiles: Floats, vector: Floats, out: Floats) -> None:

@@ -1,9 +1,9 @@
 /* The frame path: serialised slopes in, serialised commands out. No allocation once made, no lock, no interpreter.
  *
- * law.c holds the control law, gate.c the frame gate around it, ring.c what both leave for the recorder; ros.c drives
- * them from rcl. What they do is described
- * where Python wraps them: srtomo_rtc/loop.py and srtomo_rtc/hrtc.py. Structures that Python reads are mirrored in
- * srtomo_rtc/native.py, which compares srt_abi() with its own sum.
+ * law.c holds the control law, crew.c the threads that share its products, gate.c the frame gate around it, ring.c what
+ * both leave for the recorder; ros.c drives them from rcl. What they do is described where Python wraps them:
+ * srtomo_rtc/loop.py, crew.py and hrtc.py. Structures that Python reads are mirrored in srtomo_rtc/native.py, which
+ * compares srt_abi() with its own sum.
  *
  * Threads: one thread, the loop's, calls everything here but srt_loop_post, srt_loop_request, srt_gate_want_snapshot and
  * the srt_*_next functions, which are for one other thread at a time (or several under the interpreter's lock).
@@ -15,6 +15,8 @@
 #include <stdbool.h>
 #include <stddef.h>
 #include <stdint.h>
+
+#include "crew.h"
 
 enum {
     SRT_HISTORY = 64,   /* commands remembered, frames */
@@ -84,6 +86,7 @@ typedef struct {
 
     /* the loop's own; what stands before is mirrored */
     _Atomic(const srt_program *) posted;
+    srt_crew *crew; /* that shares the products; NULL: the loop's thread alone */
     const srt_program *program;
     const srt_matrices *matrices; /* of the next frame: the newest epoch's, or the fallback's */
     bool several;                 /* earlier exposures are in the next command */
@@ -104,6 +107,8 @@ typedef struct {
 srt_loop *srt_loop_new(const uint32_t *n_subapertures, uint32_t n_sensors, uint32_t n_commands, float delay,
                        uint32_t max_epochs);
 void srt_loop_free(srt_loop *loop);
+/* Share products with a crew, or NULL: with none. While the loop's thread does not run. */
+void srt_loop_use(srt_loop *loop, srt_crew *crew);
 void srt_loop_start(srt_loop *loop, int64_t frame, int closed);
 /* Before srt_loop_resume: an earlier exposure that was answered OK. slopes: (n_slopes) sensor by sensor, x then y. */
 void srt_loop_remember(srt_loop *loop, int64_t frame, const float *slopes, int64_t newest, int64_t before,

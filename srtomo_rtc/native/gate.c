@@ -575,6 +575,6 @@ void srt_gate_flatten(srt_gate *shared)
 
 size_t srt_abi(void)
 {
-    return sizeof(srt_matrices) + sizeof(srt_program) + offsetof(srt_loop, posted) + sizeof(srt_change) +
-           sizeof(srt_snapshot) + sizeof(srt_gate);
+    return sizeof(srt_product) + sizeof(srt_matrices) + sizeof(srt_program) + offsetof(srt_loop, posted) +
+           sizeof(srt_change) + sizeof(srt_snapshot) + sizeof(srt_gate);
 }

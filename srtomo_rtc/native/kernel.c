@@ -52,6 +52,18 @@ WIDEST void srt_accumulate_int16(const int16_t *tiles, size_t n_tiles, size_t n_
     }
 }
 
+void srt_multiply(const srt_product *product, size_t from, size_t to)
+{
+    const char *tiles = (const char *)product->tiles + from * product->n_columns * SRT_COLUMN;
+    size_t n = to - from, columns = product->n_columns, first = product->first, last = product->last;
+    if (product->int16)
+        srt_accumulate_int16((const int16_t *)tiles, n, columns, first, last, product->vector,
+                             product->sums + from * SRT_TILE_INT16);
+    else
+        srt_accumulate((const float *)tiles, n, columns, first, last, product->vector,
+                       product->sums + from * SRT_TILE);
+}
+
 WIDEST bool srt_all_finite(const float *values, size_t n)
 {
     const uint32_t exponent = 0x7f800000;

@@ -4,6 +4,7 @@
 #include <stdlib.h>
 #include <string.h>
 
+#include "crew.h"
 #include "kernel.h"
 
 static float *floats(size_t n)
@@ -80,6 +81,11 @@ void srt_interleave(const void *xy, size_t n, float *out)
         memcpy(out + 2 * i, x + i * sizeof(float), sizeof(float));
         memcpy(out + 2 * i + 1, y + i * sizeof(float), sizeof(float));
     }
+}
+
+void srt_loop_use(srt_loop *loop, srt_crew *crew)
+{
+    loop->crew = crew;
 }
 
 /* -- from any thread ---------------------------------------------------------------------------------------------- */
@@ -164,11 +170,11 @@ static size_t n_tiles(const srt_loop *loop)
 static void accumulate(const srt_loop *loop, const srt_matrices *matrices, uint32_t sensor, size_t first, size_t last,
                        const float *slopes, float *sums)
 {
-    size_t columns = 2 * (size_t)loop->n_subapertures[sensor];
-    if (matrices->R_scales[sensor])
-        srt_accumulate_int16(matrices->R[sensor], loop->n_rows / SRT_TILE_INT16, columns, first, last, slopes, sums);
-    else
-        srt_accumulate(matrices->R[sensor], n_tiles(loop), columns, first, last, slopes, sums);
+    bool int16 = matrices->R_scales[sensor] != NULL;
+    srt_product product = {.tiles = matrices->R[sensor], .n_tiles = int16 ? loop->n_rows / SRT_TILE_INT16 : n_tiles(loop),
+                           .n_columns = 2 * (size_t)loop->n_subapertures[sensor], .first = first, .last = last,
+                           .vector = slopes, .sums = sums, .int16 = int16};
+    srt_crew_multiply(loop->crew, &product);
 }
 
 /* total += sums of one sensor, scaled if they are of integers. */
@@ -194,7 +200,9 @@ static void multiply_mirror(srt_loop *loop, const float *Q, srt_mirror mirror, f
     for (size_t i = 0; i < m; i++)
         u[i] = (share * newest[i] + rest * before[i]) - offset[i];
     zero(out, m);
-    srt_accumulate(Q, n_tiles(loop), loop->n_commands, 0, loop->n_commands, u, out);
+    srt_product product = {.tiles = Q, .n_tiles = n_tiles(loop), .n_columns = loop->n_commands,
+                           .last = loop->n_commands, .vector = u, .sums = out};
+    srt_crew_multiply(loop->crew, &product);
 }
 
 static bool kept_back(const srt_loop *loop, int64_t n)
