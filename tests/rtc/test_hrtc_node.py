@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import time
 from contextlib import suppress
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -18,6 +19,7 @@ from srtomo_core.system import load_system
 from srtomo_ops.simulate import program_of, run
 from srtomo_rtc.events import PROGRAM_KINDS, EventKind
 from srtomo_rtc.loop import Settings, Verdict
+from srtomo_rtc.vmm import instructions
 from srtomo_sim.mirror import interaction_matrix
 from srtomo_sim.plant import Plant
 from srtomo_sim.sky import prepare
@@ -37,6 +39,7 @@ from std_srvs.srv import SetBool
 from srtomo_ops.operator import Operator, OperatorError
 
 FRAMES, SEED = 500, 11
+CREW = min(2, len(os.sched_getaffinity(0)))  # threads of the loop of one of the HRTCs
 SYSTEM = load_system("mini")
 LAYOUT = Layout(SYSTEM)
 
@@ -99,6 +102,12 @@ def set_parameters(operator: Operator, **values) -> list[Any]:
     return operator.call(SetParameters, "hrtc/set_parameters", request).results
 
 
+def helpers_of(process) -> int:
+    """Threads of the process that share the loop's products."""
+    tasks = Path(f"/proc/{process.pid}/task")
+    return sum((task / "comm").read_text().strip() == "srtomo-helper" for task in tasks.iterdir())
+
+
 def answers(operator: Operator) -> bool:
     """Whether an SRTC answers: one that was killed is still known for a while, and does not."""
     with suppress(OperatorError):
@@ -138,7 +147,9 @@ def others(start_hrtc, folder):
     """HRTCs that are not part of the run, each in its namespace; started together, for starting takes a while."""
     assert not (folder / "later.npz").exists()
     return SimpleNamespace(
-        wrong_file=start_hrtc("wrong", matrix="later.npz"), fresh=start_hrtc("fresh"), cycled=start_hrtc("cycled")
+        wrong_file=start_hrtc("wrong", matrix="later.npz"),
+        fresh=start_hrtc("fresh"),
+        cycled=start_hrtc("cycled", f"threads:={CREW}"),
     )
 
 
@@ -473,6 +484,7 @@ def test_round_and_round_the_lifecycle(ros, others):
     for _ in range(2):
         for transition in ("configure", "activate", "deactivate", "activate", "deactivate", "cleanup"):
             operator.transition(transition)
+    assert helpers_of(process) == 0
     # an activation that is not possible now: refused by its label; an id alone makes rclpy raise
     with pytest.raises(OperatorError, match="activate"):
         operator.transition("activate")
@@ -482,7 +494,11 @@ def test_round_and_round_the_lifecycle(ros, others):
     assert operator.count_subscribers(wire.SLOPES.name) == 0
     operator.transition("configure")
     wait_until(operator, lambda: operator.hrtc is not None and operator.hrtc.state == "inactive")
-    assert operator.hrtc.realtime.count("SCHED_FIFO") == 1
+    realtime = operator.hrtc.realtime
+    assert realtime.count("SCHED_FIFO") == 1
+    assert f"{instructions()}, {CREW} threads (asked for); measured: float32 with {CREW} thread" in realtime
+    assert "int16 with" in realtime and realtime.count("affinity of the helpers cores") == (CREW > 1)
+    assert helpers_of(process) == CREW - 1
     assert process.terminate() == 0, process.output  # inactive
     assert process.output.count("Traceback") == 1
     operator.destroy_node()
