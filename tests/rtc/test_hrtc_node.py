@@ -38,7 +38,7 @@ from std_srvs.srv import SetBool
 
 from srtomo_ops.operator import Operator, OperatorError
 
-FRAMES, SEED = 500, 11
+FRAMES, SEED = 1500, 11
 CREW = min(2, len(os.sched_getaffinity(0)))  # threads of the loop of one of the HRTCs
 SYSTEM = load_system("mini")
 LAYOUT = Layout(SYSTEM)
