@@ -17,13 +17,13 @@ from dataclasses import dataclass
 from operator import attrgetter
 from pathlib import Path
 from types import TracebackType
-from typing import IO
+from typing import IO, Any
 
 import yaml
 from mcap.writer import CompressionType, Writer
 
 from srtomo_core.mcap_reader import METADATA_RECORD, REPEATED, BagError, BagMessage, McapReader
-from srtomo_core.messages import definition, type_hash
+from srtomo_core.messages import decode_recorded, definition, type_hash
 
 __all__ = ["METADATA_RECORD", "BagError", "BagMessage", "BagReader", "BagWriter", "repair"]
 
@@ -228,15 +228,16 @@ class BagWriter:
         written.messages += 1
         written.latched.append(message)
 
-    def _copy(self, reader: BagReader) -> None:
-        """All messages of another bag, with the definitions and qualities of service that it recorded."""
+    def declare_as(self, reader: BagReader) -> None:
+        """Announce the topics of another bag, with the definitions and qualities of service that it recorded.
+
+        Its messages may be older than ours, and can then be written as they are.
+        """
         for file in reader.files:
             for channel in file.channels.values():
                 if channel.topic not in self._topics:
                     schema = file.schemas[channel.schema_id]
                     self._declare(channel.topic, schema.name, schema.data.decode(), channel.metadata)
-        for message in reader:
-            self.write(*message)
 
     def flush(self) -> None:
         """End the chunk in progress, hand everything to the operating system, and begin a new file if it is time."""
@@ -380,9 +381,12 @@ class BagReader:
             file.without_repeated()
         self.metadata = {key: value for key, value in self.files[0].metadata.items() if key != REPEATED}
         self.topics: dict[str, str] = {}
+        self._definitions: dict[str, bytes] = {}
         counts: Counter[str] = Counter()
         for file in self.files:
-            self.topics |= {channel.topic: file.schemas[channel.schema_id].name for channel in file.channels.values()}
+            schemas = {channel.topic: file.schemas[channel.schema_id] for channel in file.channels.values()}
+            self.topics |= {topic: schema.name for topic, schema in schemas.items()}
+            self._definitions |= {schema.name: schema.data for schema in schemas.values()}
             counts.update(file.counts)
         self.counts = {topic: counts[topic] for topic in self.topics}
         self.cut = "; ".join(f"{file.path.name} {file.cut}" for file in self.files if file.cut) or None
@@ -423,6 +427,15 @@ class BagReader:
 
     def __iter__(self) -> Iterator[BagMessage]:
         return self.messages()
+
+    def decode(self, message: BagMessage) -> Any:
+        """A message of this bag as an object, by the definition in the bag (:func:`decode_recorded`).
+
+        Raises:
+            MessageError: no message of that definition.
+        """
+        text = self._definitions[message.type].decode(errors="replace")
+        return decode_recorded(message.type, message.data, text)
 
     def close(self) -> None:
         """Close the files."""
@@ -469,5 +482,7 @@ def repair(path: str | Path, out: str | Path) -> int:
         if not reader.message_count:
             raise BagError(f"{path}: {reader.cut}: nothing to recover")
         with BagWriter(out, reader.metadata) as writer:
-            writer._copy(reader)
+            writer.declare_as(reader)
+            for message in reader:
+                writer.write(*message)
         return reader.message_count

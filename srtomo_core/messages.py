@@ -97,6 +97,32 @@ def decode(type_name: str, data: bytes) -> Any:
         raise MessageError(f"{len(data)} bytes are no {type_name}: {error}") from None
 
 
+@cache
+def _recorded_typestore(type_name: str, text: str) -> Typestore:
+    store = get_typestore(Stores.ROS2_JAZZY)
+    store.register(get_types_from_msg(text, type_name))
+    return store
+
+
+def decode_recorded(type_name: str, data: bytes, text: str) -> Any:
+    """A serialised message of the definition that was recorded with it, as :func:`decode` gives one of ours.
+
+    Fields that were not there yet are zero or empty: what is new in a message has to mean, by that, what was before.
+
+    Raises:
+        MessageError: no such type, or not a message of it.
+    """
+    _check_type(type_name)
+    if text == definition(type_name):
+        return decode(type_name, data)
+    try:
+        old = _recorded_typestore(type_name, text).deserialize_cdr(data, type_name)
+    except Exception as error:
+        raise MessageError(f"{len(data)} bytes are no {type_name} as recorded: {error}") from None
+    fields = {name: getattr(old, name, empty) for name, empty in vars(_message(type_name, {})).items()}
+    return typestore().types[type_name](**fields)
+
+
 def encode(type_name: str, **fields: Any) -> bytes:
     """Serialise a message; fields that are not given are zero or empty, nested messages are mappings.
 

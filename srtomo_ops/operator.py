@@ -161,6 +161,16 @@ class Operator(Node):
         if not response.success:
             raise OperatorError(f"hrtc/close_loop: {response.message}")
 
+    def flatten(self) -> None:
+        """Open the loop and put the static shape on at once, instead of relaxing to it.
+
+        Raises:
+            OperatorError: refused.
+        """
+        response = self.call(Trigger, "hrtc/flat", Trigger.Request())
+        if not response.success:
+            raise OperatorError(f"hrtc/flat: {response.message}")
+
     def start_sim(self) -> None:
         """Let the simulated plant publish its first frame.
 

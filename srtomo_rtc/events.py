@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from srtomo_rtc.hrtc import Change, Snapshot
-from srtomo_rtc.loop import Program, Settings
+from srtomo_rtc.loop import LoopState, Program, Settings
 from srtomo_rtc.vmm import KERNELS
 
 
@@ -27,6 +27,11 @@ class EventKind(enum.IntEnum):
     LIFECYCLE = 7
 
 
+SCALARS = (
+    "polc", "leak", "relaxation", "command_limit", "slew_limit", "rms_limit", "gain_ramp", "fault_budget", "watchdog",
+)  # fmt: skip
+"""Of Settings: what an operator sets by a parameter of that name, and what HrtcEvent carries under it."""
+
 PROGRAM_KINDS = (EventKind.SETTINGS, EventKind.COMMIT, EventKind.ROLLBACK)
 """Events that say what the loop runs from their first frame on."""
 
@@ -42,7 +47,7 @@ def event_fields(
     *,
     session: int = 0,
     frame: int = 0,
-    closed: bool = False,
+    loop_state: LoopState = LoopState.OPEN,
     delay: float = 0.0,
     program: Program | None = None,
     settings: Settings | None = None,
@@ -53,7 +58,7 @@ def event_fields(
         "text": text,
         "session": session,
         "first_frame": frame,
-        "loop_state": int(closed),
+        "loop_state": int(loop_state),
         "delay": delay,
     }
     if program is not None:
@@ -61,8 +66,7 @@ def event_fields(
         fields |= {"reconstructor": slot.id, "sha256": list(slot.sha256), "kernel": KERNELS[slot.kernel]}
         settings = program.settings
     if settings is not None:
-        names = ("polc", "leak", "relaxation", "command_limit", "fault_budget")
-        fields |= {"settings": settings.id} | {name: getattr(settings, name) for name in names}
+        fields |= {"settings": settings.id} | {name: getattr(settings, name) for name in SCALARS}
     if program is not None and kind in PROGRAM_KINDS:
         fields |= {
             "offset": _floats(program.settings.offset),
@@ -78,7 +82,7 @@ def change_fields(change: Change, kind: EventKind, text: str, delay: float) -> d
         text,
         session=change.session,
         frame=change.frame,
-        closed=change.closed,
+        loop_state=change.loop_state,
         delay=delay,
         program=change.program,
     )
@@ -89,8 +93,9 @@ def state_fields(snapshot: Snapshot) -> dict[str, Any]:
     fields: dict[str, Any] = {
         "session": snapshot.session,
         "frame": snapshot.frame,
-        "loop_state": int(snapshot.closed),
+        "loop_state": int(snapshot.loop_state),
         "consecutive_holds": snapshot.consecutive_holds,
+        "frames_closed": snapshot.frames_closed,
         "first_frame": snapshot.first_frame,
         "state": _floats(snapshot.state),
         "n_frames": len(snapshot.history),

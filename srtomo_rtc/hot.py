@@ -116,10 +116,16 @@ class HotEndpoints:
 
     def _run_here(self, hrtc: Hrtc) -> None:
         hrtc.start()
+        looked = time.monotonic_ns()
         while not hrtc.stopping:
             self.wait(_TIMEOUT)
-            while (message := self.take()) is not None:
-                hrtc.offer(message, time.monotonic_ns())
+            look = time.monotonic_ns()
+            while (taken := self.take()) is not None:
+                message, stamp = taken
+                looked = native.lib.srt_received(stamp, looked) + 1
+                hrtc.offer(message, looked)
+                look = time.monotonic_ns()
+            looked = max(look, looked)
             hrtc.advance()
             hrtc.idle(time.monotonic_ns())
         if hrtc.not_flat:
@@ -137,10 +143,13 @@ class HotEndpoints:
         self._wait_set.add_guard_condition(self._guard.handle)
         self._wait_set.wait(timeout_ns)
 
-    def take(self) -> bytes | None:
-        """The next serialised SlopeFrame, or None. The loop's thread."""
+    def take(self) -> tuple[bytes, int] | None:
+        """The next serialised SlopeFrame and when the middleware received it (ns of the system's clock), or None.
+
+        The loop's thread.
+        """
         taken = self._subscription.handle.take_message(SlopeFrame, True)
-        return None if taken is None else taken[0]
+        return None if taken is None else (taken[0], taken[1]["received_timestamp"])
 
     def publish(self, message: bytes) -> None:
         """Publish a serialised DmCommand. The loop's thread."""

@@ -22,7 +22,7 @@ from srtomo_core.layout import Layout
 from srtomo_core.ring import RingWriter
 from srtomo_rtc import native
 from srtomo_rtc.latency import LatencyHistogram
-from srtomo_rtc.loop import HISTORY, Loop, Owner, Program, check_size
+from srtomo_rtc.loop import HISTORY, Loop, LoopState, Owner, Program, check_size
 from srtomo_rtc.native import lib
 
 Floats = NDArray[np.float32]
@@ -46,6 +46,10 @@ class Counters:
     dropped_fingerprint: int = 0
     dropped_malformed: int = 0
     clipped: int = 0
+    slewed: int = 0
+    scaled: int = 0
+    fallback: int = 0
+    changes_lost: int = 0
 
 
 class Change(NamedTuple):
@@ -54,9 +58,10 @@ class Change(NamedTuple):
     what: str
     session: int
     frame: int
-    closed: bool
+    loop_state: LoopState
     program: Program | None
     reason: str
+    by_itself: bool = False
 
 
 class Snapshot(NamedTuple):
@@ -66,9 +71,10 @@ class Snapshot(NamedTuple):
     stamp_nanosec: int
     session: int
     frame: int
-    closed: bool
+    loop_state: LoopState
     program: Program | None
     consecutive_holds: int
+    frames_closed: int
     first_frame: int
     state: Floats
     history: Floats
@@ -143,6 +149,8 @@ class Hrtc:
         self._error: BaseException | None = None
         self._c.publish = self._callback = native.PUBLISH(self._publisher(publish))
         self.latency = LatencyHistogram(shared=self._c.latency)
+        self.frame_latency = LatencyHistogram(shared=self._c.frame_latency)
+        self._offered = b""
         self.changes: _Told[Change] = _Told(self._next_change)
         self.snapshots: _Told[Snapshot] = _Told(self._next_snapshot)
 
@@ -163,11 +171,6 @@ class Hrtc:
         """As they are now."""
         counters = self._c.counters
         return Counters(*(getattr(counters, name) for name in native.COUNTERS))
-
-    @property
-    def changes_lost(self) -> int:
-        """Changes that nobody took in time: the events then do not say all that a replay needs."""
-        return int(self._c.counters.changes_lost)
 
     @property
     def stopping(self) -> bool:
@@ -196,12 +199,13 @@ class Hrtc:
         lib.srt_gate_start(self.gate)
 
     def offer(self, buffer: bytes, now_ns: int) -> None:
-        """Put one serialised SlopeFrame in its place; ``now_ns`` (monotonic) is when it was taken.
+        """Put one serialised SlopeFrame in its place; ``now_ns`` (monotonic) is when it was received.
 
         Its product is formed at once if it belongs to the next frame. Nothing is answered before :meth:`advance`,
         unless frames ahead of the assembly memory force it.
         """
         lib.srt_gate_offer(self.gate, buffer, len(buffer), now_ns)
+        self._offered = buffer  # the library looks at it once more
         self._raise()
 
     def advance(self) -> None:
@@ -210,8 +214,13 @@ class Hrtc:
         self._raise()
 
     def idle(self, now_ns: int) -> None:
-        """No slopes are waiting: take up what was posted or requested, unless a frame is just coming in."""
+        """No slopes are waiting: take up what was posted or requested, unless a frame is just coming in.
+
+        While no slopes come at all, this is also where a closed loop opens after the watchdog's time, and where FLAT is
+        published: either answers the next frame with the offset.
+        """
         lib.srt_gate_idle(self.gate, now_ns)
+        self._raise()
 
     def flatten(self) -> None:
         """Open the loop and answer the next frame with the offset alone, whether or not its slopes came."""
@@ -245,12 +254,18 @@ class Hrtc:
         if not lib.srt_gate_next_change(self.gate, c):
             return None
         what, reason = ("SESSION", "PROGRAM", "LOOP")[c.what], ""
+        by_itself = what == "LOOP" and c.reason in (native.FAULTS, native.SILENCE)
         if what == "SESSION":
             goes_on = f"frames go on at {c.frame} instead of {c.number}"
             reason = goes_on if c.reason == native.GOES_ON else "slopes of a new session"
         elif what == "LOOP":
-            reason = f"{c.number} frames held in a row" if c.reason == native.FAULTS else "asked for"
-        return Change(what, c.session, c.frame, bool(c.closed), self.loop.program_named(c.token), reason)
+            reason = "asked for"
+            if c.reason == native.FAULTS:
+                reason = f"{c.number} frames held in a row"
+            elif c.reason == native.SILENCE:
+                reason = f"no slopes for {c.number * 1e-9:.1f} s"
+        program = self.loop.program_named(c.token)
+        return Change(what, c.session, c.frame, LoopState(c.state), program, reason, by_itself)
 
     def _next_snapshot(self) -> Snapshot | None:
         pointer = lib.srt_gate_next_snapshot(self.gate)
@@ -262,7 +277,8 @@ class Hrtc:
         history = native.view(self._owner, c.history, (HISTORY, n_rows))[:, :m]
         n = min(HISTORY, c.frame + 1 - c.first_frame)
         rows = [(c.frame + 1 - n + i) % HISTORY for i in range(n)]
-        made = Snapshot(c.stamp_sec, c.stamp_nanosec, c.session, c.frame, bool(c.closed), loop.program_named(c.token),
-                        c.consecutive_holds, c.first_frame, state, history[rows].copy())  # fmt: skip
+        made = Snapshot(c.stamp_sec, c.stamp_nanosec, c.session, c.frame, LoopState(c.loop_state),
+                        loop.program_named(c.token), c.consecutive_holds, c.frames_closed, c.first_frame, state,
+                        history[rows].copy())  # fmt: skip
         lib.srt_gate_snapshot_done(self.gate)
         return made

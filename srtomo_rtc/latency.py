@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import math
 
 import numpy as np
 
@@ -42,6 +43,26 @@ class LatencyHistogram:
     def max_ns(self) -> int:
         """The largest."""
         return int(self._c.max_ns)
+
+    @property
+    def std(self) -> float:
+        """Standard deviation, s; 0 before the first count."""
+        n = int(self.counts.sum())
+        if n == 0:
+            return 0.0
+        mean = self._c.sum / n
+        # another thread may be adding: the three are not of one moment
+        return math.sqrt(max(self._c.squares / n - mean * mean, 0.0)) * 1e-9
+
+    def summary(self) -> dict[str, float]:
+        """What HrtcStatus carries, s: p50, p99, p999, max and std."""
+        return {
+            "p50": self.quantile(0.5),
+            "p99": self.quantile(0.99),
+            "p999": self.quantile(0.999),
+            "max": self.max_ns * 1e-9,
+            "std": self.std,
+        }
 
     def quantile(self, share: float) -> float:
         """Upper edge of the bin that holds quantile ``share`` (0 to 1), s; 0 before the first count."""

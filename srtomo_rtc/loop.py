@@ -15,6 +15,10 @@ one of them held, missing, from an open loop or from before the session, the fal
 reconstructor for one exposure (R_0 alone would have the wrong gain). What is remembered are slopes and what was on the
 mirror, not products: a commit costs no fallback.
 
+What limits a command acts in this order, and the state follows what was put on the mirror: each actuator's clip; a
+command whose rms over all actuators is too large is scaled down, its shape kept; the slew limit. After closing the gain
+may rise in a ramp: in frame j of N (from 1) ``j g / N`` stands for every g above.
+
 The history holds m, indexed by exposure, and o is taken off when it is used: an offset and its slope reference
 ``y_ref = -G o`` then change together without a transient, whatever the delay.
 
@@ -64,6 +68,14 @@ class Verdict(enum.IntEnum):
     HOLD_HISTORY = 6
 
 
+class LoopState(enum.IntEnum):
+    """The constants of msgs_schema/msg/HrtcEvent."""
+
+    OPEN = 0
+    CLOSED = 1
+    FLAT = 2
+
+
 @dataclass(frozen=True, eq=False)
 class Settings:
     """What an operator sets. Immutable; arrays must not be written to.
@@ -74,7 +86,11 @@ class Settings:
         leak: per frame, 0 <= leak < 1.
         relaxation: share of the state that an open loop drops each frame, 0 < relaxation <= 1.
         command_limit: m of wavefront, on top of each reconstructor's own limits.
+        slew_limit: m that a command may change in a frame; 0: any.
+        rms_limit: m, of all commands of a frame: a larger command is scaled down to it, its shape kept; 0: any.
+        gain_ramp: frames in which the gain rises to its value once the loop is closed; 0: at once.
         fault_budget: consecutive held frames after which the loop opens.
+        watchdog: s without slopes after which a closed loop opens, at least 0.1; 0: never.
         offset: (n_commands,) m of wavefront.
         slope_reference: (n_slopes,) rad; ``-G offset`` for a wanted static shape, 0 for an aberration to be corrected.
     """
@@ -86,11 +102,15 @@ class Settings:
     leak: float = 0.0
     relaxation: float = 0.1
     command_limit: float = math.inf
+    slew_limit: float = 0.0
+    rms_limit: float = 0.0
+    gain_ramp: int = 0
     fault_budget: int = 50
+    watchdog: float = 0.0
 
     def __post_init__(self) -> None:
         # as they travel in events: a replay must compute with the same numbers
-        for name in ("leak", "relaxation", "command_limit"):
+        for name in ("leak", "relaxation", "command_limit", "slew_limit", "rms_limit", "watchdog"):
             object.__setattr__(self, name, float(np.float32(getattr(self, name))))
 
 
@@ -258,9 +278,14 @@ class Program:
             settings.fault_budget,
             len(epochs),
             settings.polc,
+            settings.gain_ramp,
             slot.gain,
             keep * (1.0 - slot.gain) if settings.polc else keep,
             settings.relaxation,
+            keep,
+            settings.slew_limit or math.inf,
+            settings.rms_limit or math.inf,
+            int(settings.watchdog * 1e9),
             *(vector.ctypes.data for vector in (offset, limits, all_epochs, one)),
             matrices[0],
             ctypes.pointer(matrices[1]),
@@ -371,6 +396,21 @@ class Loop:
         return bool(self._c.closed)
 
     @property
+    def loop_state(self) -> LoopState:
+        """``closed``, and else whether the loop relaxes or is held flat."""
+        return LoopState.CLOSED if self._c.closed else LoopState.FLAT if self._c.held_flat else LoopState.OPEN
+
+    @property
+    def frames_closed(self) -> int:
+        """Answered since the loop was closed."""
+        return int(self._c.frames_closed)
+
+    @property
+    def gain(self) -> float:
+        """Of the next frame, if the loop is closed."""
+        return float(self._c.gain)
+
+    @property
     def verdict(self) -> Verdict:
         """Of the last answer."""
         return Verdict(self._c.verdict)
@@ -379,6 +419,16 @@ class Loop:
     def n_clipped(self) -> int:
         """Of the last answer, as in DmCommand."""
         return int(self._c.n_clipped)
+
+    @property
+    def n_slewed(self) -> int:
+        """Actuators of the last answer that the slew limit kept behind."""
+        return int(self._c.n_slewed)
+
+    @property
+    def scaled(self) -> bool:
+        """Whether the last answer was scaled down to ``rms_limit``."""
+        return bool(self._c.scaled)
 
     @property
     def mirror_frame(self) -> int:
@@ -404,6 +454,11 @@ class Loop:
     def opened_by_faults(self) -> int:
         """How often the loop opened because more frames in a row were held than the budget allows."""
         return int(self._c.opened_by_faults)
+
+    @property
+    def opened_by_silence(self) -> int:
+        """How often the loop opened because no slopes came for longer than the watchdog allows."""
+        return int(self._c.opened_by_silence)
 
     @property
     def program(self) -> Program | None:
@@ -437,7 +492,11 @@ class Loop:
 
     def request(self, closed: bool) -> None:
         """Close or open the loop from the next frame that is prepared: one flag is stored."""
-        lib.srt_loop_request(self._pointer, closed)
+        self.request_state(LoopState.CLOSED if closed else LoopState.OPEN)
+
+    def request_state(self, state: LoopState) -> None:
+        """The same; FLAT opens the loop and puts the offset on without relaxing, as fast as the slew limit lets."""
+        lib.srt_loop_request(self._pointer, state)
 
     def use(self, crew: Crew | None) -> None:
         """Share the products with a crew, which must stay open until this was called again; None: with nobody. While
@@ -446,12 +505,12 @@ class Loop:
 
     # -- from the loop's thread -------------------------------------------------------------------------------------
 
-    def start(self, frame: int, closed: bool = False) -> None:
+    def start(self, frame: int, state: LoopState = LoopState.OPEN) -> None:
         """Begin a session at ``frame``: the mirror is taken to be flat until commands say otherwise.
 
         What was posted waits for the next :meth:`prepare`.
         """
-        lib.srt_loop_start(self._pointer, frame, closed)
+        lib.srt_loop_start(self._pointer, frame, state)
 
     def resume(
         self,
@@ -459,8 +518,9 @@ class Loop:
         first_frame: int,
         state: Floats,
         history: Floats,
-        closed: bool,
+        loop_state: LoopState,
         consecutive_holds: int,
+        frames_closed: int,
         exposures: Mapping[int, tuple[Sequence[Floats], tuple[int, int, float]]] | None = None,
     ) -> None:
         """Continue after ``frame`` with a recorded state. Not while running.
@@ -470,9 +530,10 @@ class Loop:
             exposures: of earlier frames that were answered OK, by frame: the slopes of each sensor, and what was on the
                 mirror, as in DmCommand. Of more than ``max_epochs - 1`` only the newest matter.
         """
-        self.start(first_frame, closed)
+        self.start(first_frame, loop_state)
         self._c.frame = frame + 1
         self._c.consecutive_holds = consecutive_holds
+        self._c.frames_closed = frames_closed
         self.state[:] = state
         for row, command in enumerate(history[-HISTORY:], start=frame + 1 - len(history[-HISTORY:])):
             self._history[row % HISTORY] = command
@@ -505,8 +566,15 @@ class Loop:
         """Answer a frame without using its slopes: the state is kept (an open loop relaxes on)."""
         return Verdict(lib.srt_loop_hold(self._pointer, verdict))
 
+    def flatten(self) -> Verdict:
+        """Answer a frame with the offset alone, whatever came of its slopes and however far the mirror has to go."""
+        return Verdict(lib.srt_loop_flatten(self._pointer))
+
     def history(self, frames: int) -> Floats:
-        """The last commands, (n, n_commands) with n <= ``frames``, oldest first. A copy: not for the hot path."""
+        """The last commands, (n, n_commands) with n <= ``frames``, oldest first. A copy: not for the hot path.
+
+        From another thread a command that is just being made may be in place of the oldest.
+        """
         n = min(frames, HISTORY, self.frame - self.first_frame)
         rows: Sequence[int] = [(self.frame - n + i) % HISTORY for i in range(n)]
         return self._history[rows].copy()

@@ -13,6 +13,7 @@ from ctypes import (
     Structure,
     c_bool,
     c_char_p,
+    c_double,
     c_float,
     c_int,
     c_int32,
@@ -68,9 +69,14 @@ class Program(Structure):
         ("fault_budget", c_uint32),
         ("n_epochs", c_uint32),
         ("polc", c_uint32),
+        ("ramp", c_uint32),
         ("gain", c_float),
         ("keep", c_float),
         ("relaxation", c_float),
+        ("retained", c_float),
+        ("slew", c_float),
+        ("rms", c_float),
+        ("watchdog_ns", c_int64),
         ("offset", c_void_p),
         ("limit", c_void_p),
         ("reference", c_void_p),
@@ -91,15 +97,21 @@ class Loop(Structure):
         ("mirror_frame_before", c_int64),
         ("token", c_uint64),
         ("opened_by_faults", c_uint64),
+        ("opened_by_silence", c_uint64),
         ("mirror_fraction", c_float),
+        ("gain", c_float),
         ("sensors", c_uint32),
         ("used", c_uint32),
         ("all_sensors", c_uint32),
         ("consecutive_holds", c_uint32),
+        ("frames_closed", c_uint32),
         ("n_clipped", c_uint32),
+        ("n_slewed", c_uint32),
+        ("scaled", c_int32),
         ("verdict", c_int32),
         ("closed", c_int32),
-        ("requested_closed", c_int32),
+        ("held_flat", c_int32),
+        ("requested", c_int32),
         ("n_sensors", c_uint32),
         ("n_commands", c_uint32),
         ("n_rows", c_uint32),
@@ -124,23 +136,34 @@ COUNTERS = (
     "dropped_fingerprint",
     "dropped_malformed",
     "clipped",
+    "slewed",
+    "scaled",
+    "fallback",
+    "changes_lost",
 )
 
 
 class Counters(Structure):
     """``srt_counters``."""
 
-    _fields_ = [(name, c_uint64) for name in (*COUNTERS, "changes_lost")]
+    _fields_ = [(name, c_uint64) for name in COUNTERS]
 
 
 class Latency(Structure):
     """``srt_latency``."""
 
-    _fields_ = [("deadline_ns", c_int64), ("misses", c_int64), ("max_ns", c_int64), ("counts", c_int64 * BINS)]
+    _fields_ = [
+        ("deadline_ns", c_int64),
+        ("misses", c_int64),
+        ("max_ns", c_int64),
+        ("sum", c_double),
+        ("squares", c_double),
+        ("counts", c_int64 * BINS),
+    ]
 
 
-FAULTS, GOES_ON = 1, 3
-"""Of ``srt_reason``: the loop opened by itself; a session goes on with another frame."""
+FAULTS, GOES_ON, SILENCE = 1, 3, 4
+"""Of ``srt_reason``: the loop opened by itself; a session goes on with another frame; the loop opened by itself."""
 
 
 class Change(Structure):
@@ -153,7 +176,7 @@ class Change(Structure):
         ("number", c_int64),
         ("what", c_int32),
         ("reason", c_int32),
-        ("closed", c_int32),
+        ("state", c_int32),
     ]
 
 
@@ -168,7 +191,8 @@ class Snapshot(Structure):
         ("stamp_sec", c_int32),
         ("stamp_nanosec", c_uint32),
         ("consecutive_holds", c_uint32),
-        ("closed", c_int32),
+        ("frames_closed", c_uint32),
+        ("loop_state", c_int32),
         ("state", c_void_p),
         ("history", c_void_p),
     ]
@@ -195,6 +219,7 @@ class Gate(Structure):
         ("last_slopes_ns", c_int64),
         ("counters", Counters),
         ("latency", Latency),
+        ("frame_latency", Latency),
         ("largest_message", c_size_t),
         ("publish", PUBLISH),
         ("publish_context", c_void_p),
@@ -238,9 +263,11 @@ _FUNCTIONS: dict[str, tuple[Any, tuple[Any, ...]]] = {
     "srt_loop_add": (None, (_LOOP, c_uint32, c_void_p)),
     "srt_loop_answer": (c_int, (_LOOP, c_int64, c_int64, c_float)),
     "srt_loop_hold": (c_int, (_LOOP, c_int)),
+    "srt_loop_flatten": (c_int, (_LOOP,)),
     "srt_loop_post": (c_uint64, (_LOOP, POINTER(Program))),
     "srt_loop_request": (None, (_LOOP, c_int)),
     "srt_loop_pending": (c_int, (_LOOP,)),
+    "srt_received": (c_int64, (c_int64, c_int64)),
     "srt_latency_add": (None, (POINTER(Latency), c_int64)),
     "srt_gate_new": (_GATE, (_WORDS, c_uint32, c_uint32, c_float, c_uint32, c_char_p, c_int64, c_int64)),
     "srt_gate_free": (None, (_GATE,)),

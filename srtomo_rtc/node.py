@@ -41,7 +41,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
 from rclpy.signals import SignalHandlerOptions
-from std_srvs.srv import SetBool
+from std_srvs.srv import SetBool, Trigger
 
 from srtomo_core import wire
 from srtomo_core.layout import Layout
@@ -49,10 +49,12 @@ from srtomo_core.reconstructor import Reconstructor, ReconstructorError, load_in
 from srtomo_core.ring import RingWriter, ring_path
 from srtomo_core.system import InstrumentError, load_system
 from srtomo_rtc.crew import MAX_THREADS, SPIN_NS, Crew, candidates, choose
-from srtomo_rtc.events import EventKind, change_fields, event_fields, state_fields
+from srtomo_rtc.events import SCALARS, EventKind, change_fields, event_fields, state_fields
 from srtomo_rtc.hot import HotEndpoints
 from srtomo_rtc.hrtc import Hrtc, Snapshot
-from srtomo_rtc.loop import MAX_EPOCHS, Program, Settings
+from srtomo_rtc.latency import LatencyHistogram
+from srtomo_rtc.loop import MAX_EPOCHS, LoopState, Program, Settings
+from srtomo_rtc.offload import Offload, tilt_of_commands
 from srtomo_rtc.swap import Manifest, Refused, Swap
 from srtomo_rtc.vmm import KERNELS, instructions
 
@@ -112,9 +114,12 @@ _PARAMETERS: tuple[tuple[str, Any, ParameterDescriptor], ...] = (
     ("leak", 0.0, _number("leak of a frame; 0 at configure: the instrument's", 0.0, 0.999)),
     ("relaxation", 0.1, _number("share of the command that an open loop drops each frame", 0.001, 1.0)),
     ("command_limit", 1.0, _number("m of wavefront, on top of the instrument's stroke", 1e-9, 1.0)),
+    ("slew_limit", 0.0, _number("m of wavefront, most that a command changes in a frame; 0: no limit", 0.0, 1.0)),
+    ("rms_limit", 0.0, _number("m of wavefront, rms of all commands, scaled down to it; 0: no limit", 0.0, 1.0)),
+    ("gain_ramp", 0, _integer("frames in which the gain rises once the loop is closed; 0: at once", 0, 1_000_000)),
     ("fault_budget", 50, _integer("consecutive held frames after which the loop opens", 1, 1_000_000)),
+    ("watchdog", 10.0, _number("s without slopes after which a closed loop opens, above 0.1; 0: never", 0.0, 3600.0)),
 )
-_LIVE = ("polc", "leak", "relaxation", "command_limit", "fault_budget")
 
 
 def parameters() -> Iterable[tuple[str, Any, str]]:
@@ -138,6 +143,7 @@ class HrtcNode(LifecycleNode):
             DiagnosticArray, wire.DIAGNOSTICS.name, QoSProfile(**wire.DIAGNOSTICS.qos())
         )
         self.create_service(SetBool, "hrtc/close_loop", self._close_loop)
+        self.create_service(Trigger, "hrtc/flat", self._flat)
         self.create_service(SwapReconstructor, "hrtc/commit", self._commit)
         self.create_service(SwapReconstructor, "hrtc/roll_back", self._roll_back)
         self.create_service(SetStaticShape, "hrtc/static_shape", self._static_shape)
@@ -164,6 +170,8 @@ class HrtcNode(LifecycleNode):
         self._kinds: dict[int, tuple[EventKind, str]] = {}
         self._taken_up: tuple[Program | None, int] = (None, 0)  # the newest program that the loop runs, its first frame
         self._refused = 0
+        self._opened_by_itself = ""  # why, until an operator closes the loop again
+        self._misses_told = 0
         self._realtime: list[realtime.Outcome] = [_BLAS]
         self._cores: list[int] = []
         self._hrtc: Hrtc | None = None
@@ -233,11 +241,7 @@ class HrtcNode(LifecycleNode):
             id=1,
             offset=np.zeros(layout.n_commands, np.float32),
             slope_reference=np.zeros(layout.n_slopes, np.float32),
-            polc=self._value("polc"),
-            leak=self._value("leak") or system.loop.leak,
-            relaxation=self._value("relaxation"),
-            command_limit=self._value("command_limit"),
-            fault_budget=self._value("fault_budget"),
+            **{name: self._value(name) for name in SCALARS} | {"leak": self._value("leak") or system.loop.leak},
         )
         asked = self._value("kernel")
         if asked not in ("auto", *KERNELS):
@@ -268,6 +272,7 @@ class HrtcNode(LifecycleNode):
             max_epochs=self._value("max_epochs"),
         )
         self._hot, self._swap, self._layout, self._rate = hot, swap, layout, loop.rate
+        self._offload = Offload(tilt_of_commands(layout, G_cal))
         try:
             multiplying = self._start_crew(swap, kernel, others=asked == "auto")
             self._load_first()
@@ -387,6 +392,7 @@ class HrtcNode(LifecycleNode):
         self._hot = self._hrtc = self._swap = None
         self._kinds.clear()
         self._taken_up = (None, 0)
+        self._opened_by_itself, self._misses_told = "", 0
 
     def _end_crew(self) -> None:
         if self._crew is not None:
@@ -533,18 +539,36 @@ class HrtcNode(LifecycleNode):
         elif request.data and (self._swap is None or self._swap.active is None):
             response.message = "no reconstructor is active: commit one first"
         else:
-            opened_by_faults = hrtc.loop.opened_by_faults
-            hrtc.loop.request(closed=request.data)
-            assert self._hot is not None
-            self._hot.wake()
-            response.success = self._wait_for(lambda: hrtc.loop.closed is request.data)
-            response.message = "closed" if hrtc.loop.closed else "open"
-            if not response.success:
-                by_itself = hrtc.loop.opened_by_faults > opened_by_faults
-                reason = "it opened again by itself" if by_itself else "the loop has not taken the request up"
-                response.message += f": {reason} in {_ADOPTION_TIMEOUT:g} s"
-        self._publish_changes()
+            wanted = LoopState.CLOSED if request.data else LoopState.OPEN
+            response.success, response.message = self._request(hrtc, wanted)
         return response
+
+    def _flat(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        hrtc = self._hrtc
+        if hrtc is None or self._thread is None:
+            response.message = "the HRTC is not active"
+        else:
+            response.success, response.message = self._request(hrtc, LoopState.FLAT)
+        return response
+
+    def _request(self, hrtc: Hrtc, state: LoopState) -> tuple[bool, str]:
+        """Have the loop closed, opened or flat: whether it is, and what it is."""
+        loop = hrtc.loop
+        self._publish_changes()
+        if state is LoopState.CLOSED:
+            self._opened_by_itself = ""
+        loop.request_state(state)
+        assert self._hot is not None
+        self._hot.wake()
+        success = self._wait_for(lambda: loop.loop_state is state)
+        self._publish_changes()
+        message = loop.loop_state.name.lower()
+        if not success:
+            reason = "the loop has not taken the request up"
+            if self._opened_by_itself:
+                reason = f"it opened again by itself ({self._opened_by_itself})"
+            message += f": {reason} in {_ADOPTION_TIMEOUT:g} s"
+        return success, message
 
     def _commit(
         self, request: SwapReconstructor.Request, response: SwapReconstructor.Response
@@ -640,7 +664,7 @@ class HrtcNode(LifecycleNode):
 
     def _set_parameters(self, parameters: Sequence[Parameter]) -> SetParametersResult:
         swap = self._swap
-        changes = {p.name: p.value for p in parameters if p.name in _LIVE}
+        changes = {p.name: p.value for p in parameters if p.name in SCALARS}
         if swap is not None and changes:
             program = self._worker.submit(lambda: swap.change_settings(**changes)).result()
             text = ", ".join(f"{name} = {value}" for name, value in changes.items())
@@ -662,7 +686,7 @@ class HrtcNode(LifecycleNode):
             now = {
                 "session": hrtc.session,
                 "frame": loop.frame,
-                "closed": loop.closed,
+                "loop_state": loop.loop_state,
                 "delay": loop.delay,
                 "program": loop.program,
             }
@@ -685,6 +709,8 @@ class HrtcNode(LifecycleNode):
                 self._taken_up = (change.program, change.frame)
             else:
                 kind, text = EventKind[change.what], change.reason
+                if change.by_itself:
+                    self._opened_by_itself = text
             self._publish_event(change_fields(change, kind, text, hrtc.loop.delay))
 
     def _publish_snapshot(self, snapshot: Snapshot) -> None:
@@ -706,8 +732,9 @@ class HrtcNode(LifecycleNode):
             message.slope_publishers, message.command_readers = hot.matched()
             message.session = hrtc.session
             message.frame = max(loop.answered, 0)
-            message.loop_state = int(loop.closed)
+            message.loop_state = int(loop.loop_state)
             message.loop_opened_by_faults = loop.opened_by_faults
+            message.loop_opened_by_silence = loop.opened_by_silence
             for name in ("active", "staged", "previous"):
                 held = getattr(swap, name)
                 setattr(message, "reconstructor" if name == "active" else name, held.slot.id if held else 0)
@@ -716,13 +743,12 @@ class HrtcNode(LifecycleNode):
                 message.gain = swap.active.slot.gain
             for name, value in vars(hrtc.counters).items():
                 setattr(message, name, value)
-            latency = hrtc.latency
-            message.deadline = latency.deadline_ns * 1e-9
-            message.deadline_misses = latency.misses
-            message.latency_p50 = latency.quantile(0.5)
-            message.latency_p99 = latency.quantile(0.99)
-            message.latency_p999 = latency.quantile(0.999)
-            message.latency_max = latency.max_ns * 1e-9
+            message.deadline = hrtc.latency.deadline_ns * 1e-9
+            for before, latency in (("", hrtc.latency), ("frame_", hrtc.frame_latency)):
+                setattr(message, f"{before}deadline_misses", latency.misses)
+                for name, value in latency.summary().items():
+                    setattr(message, f"{before}latency_{name}", value)
+            message.offload_tip, message.offload_tilt = self._offload.look(loop, hrtc.session)
             message.silence = (time.monotonic_ns() - hrtc.last_slopes_ns) * 1e-9 if hrtc.session else math.inf
         self._status.publish(message)
         self._last_status = message
@@ -735,6 +761,8 @@ class HrtcNode(LifecycleNode):
         status.values = [KeyValue(key="lifecycle", value=self._lifecycle)] + [
             KeyValue(key=outcome.name, value=str(outcome)) for outcome in self._realtime
         ]
+        if self._hrtc is not None:
+            status.values += [KeyValue(key=key, value=value) for key, value in self._told(self._hrtc)]
         message = DiagnosticArray(status=[status])
         message.header.stamp = self.get_clock().now().to_msg()
         self._diagnostics.publish(message)
@@ -746,17 +774,37 @@ class HrtcNode(LifecycleNode):
         if hrtc is None or self._thread is None:
             return DiagnosticStatus.OK, self._lifecycle
         silence = (time.monotonic_ns() - hrtc.last_slopes_ns) * 1e-9
-        if hrtc.loop.opened_by_faults:
-            return DiagnosticStatus.ERROR, f"the loop opened by itself {hrtc.loop.opened_by_faults} times"
+        silent = f"no slopes for {silence:.1f} s" if silence > _SILENT and hrtc.session else ""
+        state = hrtc.loop.loop_state.name.lower()
+        if self._opened_by_itself:
+            now = f"{state}, {silent}" if silent else state
+            return DiagnosticStatus.ERROR, f"{now}; the loop opened by itself: {self._opened_by_itself}"
         if self._hot is not None and (trouble := self._hot.rivals() or self._hot.unmatched()):
             return DiagnosticStatus.WARN, trouble
         if not hrtc.session:
             return DiagnosticStatus.OK, "waiting for slopes"
-        if silence > _SILENT:
-            return DiagnosticStatus.WARN, f"no slopes for {silence:.1f} s"
-        if hrtc.latency.misses:
-            return DiagnosticStatus.WARN, f"{hrtc.latency.misses} deadline misses"
-        return DiagnosticStatus.OK, "closed" if hrtc.loop.closed else "open"
+        if silent:
+            return DiagnosticStatus.WARN, silent
+        misses, self._misses_told = hrtc.latency.misses - self._misses_told, hrtc.latency.misses
+        if misses:
+            return DiagnosticStatus.WARN, f"{state}, {misses} deadline misses in a second"
+        if lost := hrtc.counters.changes_lost:
+            return DiagnosticStatus.WARN, f"{state}; {lost} events were lost: a replay will not be exact"
+        return DiagnosticStatus.OK, state
+
+    @staticmethod
+    def _told(hrtc: Hrtc) -> Iterable[tuple[str, str]]:
+        """What happened since the HRTC was configured, for the diagnostics."""
+
+        def line(latency: LatencyHistogram) -> str:
+            parts = [f"{name} {value * 1e6:.0f} us" for name, value in latency.summary().items()]
+            return ", ".join(parts) + f"; {latency.misses} above {latency.deadline_ns * 1e-3:.0f} us"
+
+        yield "last slopes received to command published", line(hrtc.latency)
+        yield "first slopes received to command published", line(hrtc.frame_latency)
+        loop = hrtc.loop
+        yield "loop opened by itself", f"{loop.opened_by_faults} by faults, {loop.opened_by_silence} by silence"
+        yield "events lost", str(hrtc.counters.changes_lost)
 
 
 def _on_signals(react: Callable[[], None]) -> None:

@@ -15,14 +15,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from srtomo_core import wire
-from srtomo_core.bag import BagError, BagReader
+from srtomo_core.bag import BagError, BagMessage, BagReader
 from srtomo_core.exposure import Exposure, fits, subaperture_starts
 from srtomo_core.layout import Layout
-from srtomo_core.messages import decode
 from srtomo_core.reconstructor import Reconstructor, ReconstructorError, block_table, n_parts
 from srtomo_core.system import System
-from srtomo_rtc.events import PROGRAM_KINDS, EventKind
-from srtomo_rtc.loop import MAX_EPOCHS, Loop, Program, Settings, Slot, Verdict
+from srtomo_rtc.events import PROGRAM_KINDS, SCALARS, EventKind
+from srtomo_rtc.loop import MAX_EPOCHS, Loop, LoopState, Program, Settings, Slot, Verdict
 from srtomo_rtc.vmm import KERNELS
 
 _NAMED = {name: kernel for kernel, name in KERNELS.items()}
@@ -97,34 +96,32 @@ class Replay:
         except BagError:
             return None
 
-    def _of(self, topic: wire.Topic) -> Iterator[bytes]:
+    def _of(self, topic: wire.Topic) -> Iterator[BagMessage]:
         name = self._topic(topic)
-        if name is not None:
-            for message in self._reader.messages(name):
-                yield message.data
+        return iter(()) if name is None else self._reader.messages(name)
 
     def _read_everything_but_frames(self) -> None:
         self._read_reconstructors()
         seen = set()
-        for data in self._of(wire.EVENT):
+        for message in self._of(wire.EVENT):
             # a late joiner's recorder gets the latched events again
-            if data not in seen:
-                seen.add(data)
-                self.events.append(decode(wire.EVENT.type, data))
+            if message.data not in seen:
+                seen.add(message.data)
+                self.events.append(self._reader.decode(message))
         for event in self.events:
             if event.kernel and event.kernel not in _NAMED:
                 raise BagError(
                     f"{self._reader.path}: made with kernel {event.kernel}, here are {' and '.join(_NAMED)}: "
                     "bits would differ"
                 )
-        for data in self._of(wire.STATE):
-            state = decode(wire.STATE.type, data)
+        for message in self._of(wire.STATE):
+            state = self._reader.decode(message)
             self.states[state.session, state.frame] = state
 
     def _read_reconstructors(self) -> None:
         manifests = {}
-        for data in self._of(wire.RECONSTRUCTOR):
-            message = decode(wire.RECONSTRUCTOR.type, data)
+        for recorded in self._of(wire.RECONSTRUCTOR):
+            message = self._reader.decode(recorded)
             if (message.n_commands, message.n_slopes) == (
                 self.layout.n_commands,
                 self.layout.n_slopes,
@@ -136,9 +133,9 @@ class Replay:
             sha256: [np.full((n_parts(message.n_epochs), columns[1], n), np.nan, np.float32) for n in columns]
             for sha256, message in manifests.items()
         }
-        for data in self._of(wire.RECONSTRUCTOR_BLOCK):
+        for recorded in self._of(wire.RECONSTRUCTOR_BLOCK):
             try:
-                block = wire.read_block(data)
+                block = wire.read_block(recorded.data)
             except wire.WireError:
                 continue
             place = (block.epoch, block.matrix, block.first_row, len(block.rows))
@@ -180,11 +177,7 @@ class Replay:
                 id=event.settings,
                 offset=np.array(event.offset, np.float32),
                 slope_reference=np.array(event.slope_reference, np.float32),
-                polc=bool(event.polc),
-                leak=event.leak,
-                relaxation=event.relaxation,
-                command_limit=event.command_limit,
-                fault_budget=event.fault_budget,
+                **{name: getattr(event, name) for name in SCALARS},
             ),
         )
 
@@ -370,7 +363,8 @@ class _Session:
             if entry.event.kind == EventKind.SESSION:
                 self._begin(entry)
             elif self._in_step and entry.event.kind == EventKind.LOOP:
-                self._loop.request(closed=bool(entry.event.loop_state))
+                self._loop.request_state(LoopState(entry.event.loop_state))
+                self._loop.prepare()  # a loop that was opened and closed again between two frames begins its ramp anew
             elif self._in_step:
                 self._run(entry.program)
         if self._in_step:
@@ -380,7 +374,7 @@ class _Session:
         if entry.frame != self._frame:
             return  # the replay starts after it
         self._loop = Loop(self._replay.layout, entry.event.delay, self._replay.max_epochs)
-        self._loop.start(entry.frame, closed=bool(entry.event.loop_state))
+        self._loop.start(entry.frame, LoopState(entry.event.loop_state))
         self._in_step = True
         if entry.program is not None:
             self._run(entry.program)
@@ -424,17 +418,17 @@ class _Session:
                 int(state.first_frame),
                 np.asarray(state.state, np.float32),
                 history,
-                bool(state.loop_state),
+                LoopState(state.loop_state),
                 int(state.consecutive_holds),
+                int(state.frames_closed),
                 exposures,
             )
 
     def _answer(self, exposure: Exposure | None, command: wire.DmCommand) -> None:
         loop = self._loop
         if command.verdict == Verdict.OPEN and command.sensors == 0:
-            # the flat that a stopping HRTC leaves behind answers no slopes
-            loop.state[:] = 0
-            loop.hold(Verdict.OPEN)
+            # the flat that a stopping HRTC leaves behind, or one that hears nothing, answers no slopes
+            loop.flatten()
         elif command.verdict in _TIMED:
             loop.hold(Verdict(command.verdict))
         elif exposure is not None and exposure.arrived == loop.all_sensors:

@@ -21,6 +21,7 @@ EXAMPLE = """examples:
   srtomo ctl publish file                   have the SRTC publish its reconstructor 'file'
   srtomo ctl commit 0123456789abcdef 0123...   id and SHA-256, in hex, as 'srtomo ctl publish' printed them
   srtomo ctl close                          close the loop
+  srtomo ctl flat                           open it, and put the static shape on at once
   srtomo ctl sky --set 'atmosphere.r0=10 cm' --over 10s    change the simulated plant while it runs
   srtomo ctl dither gnao_ltao_sr --rms 5nm --over 30s      for 'srtomo register': shakes the mirrors, then flat
   srtomo ctl status"""
@@ -28,8 +29,8 @@ EXAMPLE = """examples:
 _PATIENCE = 10.0  # s to find a node: one that was just started takes some seconds
 
 _ACTIONS = (
-    "status", "configure", "activate", "deactivate", "cleanup", "close", "open", "start-sim", "publish", "commit",
-    "roll-back", "sky", "dither",
+    "status", "configure", "activate", "deactivate", "cleanup", "close", "open", "flat", "start-sim", "publish",
+    "commit", "roll-back", "sky", "dither",
 )  # fmt: skip
 
 
@@ -89,6 +90,8 @@ def main(options: argparse.Namespace) -> int:
             operator.transition(options.action)
         elif options.action in ("close", "open"):
             operator.close_loop(options.action == "close")
+        elif options.action == "flat":
+            operator.flatten()
         elif options.action == "start-sim":
             operator.start_sim()
         elif options.action == "publish":
@@ -145,6 +148,7 @@ def _status(operator: Operator) -> dict[str, object]:
     numbers = {name: getattr(status, name) for name in status.get_fields_and_field_types() if name != "header"}
     for name in ("reconstructor", "staged", "previous"):
         numbers[name] = f"{numbers[name]:016x}" if numbers[name] else "none"
-    numbers["loop_state"] = "closed" if status.loop_state == HrtcEvent.CLOSED else "open"
+    states = {HrtcEvent.OPEN: "open", HrtcEvent.CLOSED: "closed", HrtcEvent.FLAT: "flat"}
+    numbers["loop_state"] = states[status.loop_state]
     numbers["silence"] = status.silence if math.isfinite(status.silence) else None
     return numbers

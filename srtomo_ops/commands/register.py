@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from srtomo_core import wire
 from srtomo_core.bag import BagError, BagReader
 from srtomo_core.layout import Layout
-from srtomo_core.messages import decode
 from srtomo_core.reconstructor import load_interaction_matrix
 from srtomo_core.system import System, load_system
 from srtomo_ops.options import add_json, assignments, write_json
@@ -115,7 +114,7 @@ class _Offsets:
         self._share = np.float32(delay - self._whole)
         changes: dict[tuple[int, int], Floats] = {}
         for message in reader.messages(reader.topic(wire.EVENT.name)):
-            event = decode(wire.EVENT.type, message.data)
+            event = reader.decode(message)
             if len(event.offset) == layout.n_commands:
                 changes[event.session, event.first_frame] = np.array(event.offset, np.float32)
         keys = sorted(changes)

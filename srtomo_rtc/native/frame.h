@@ -40,6 +40,13 @@ enum srt_verdict {
 
 #define SRT_MIRROR_UNKNOWN INT64_MIN
 
+/* msgs_schema/msg/HrtcEvent's constants */
+enum srt_loop_state {
+    SRT_RELAXES, /* open: the state decays */
+    SRT_CLOSED,
+    SRT_FLAT, /* open: no state, the offset alone */
+};
+
 /* R and Q for one exposure, in tiles (kernel.h). R: of each sensor, its columns in the order x0 y0 x1 y1 ... of its
  * sub-apertures, so that what has come in order is one run of columns. */
 typedef struct {
@@ -56,7 +63,11 @@ typedef struct {
     uint32_t fault_budget;
     uint32_t n_epochs;
     uint32_t polc;
+    uint32_t ramp;       /* frames in which the gain rises to its value once the loop is closed; 0: at once */
     float gain, keep, relaxation;
+    float retained;      /* 1 - leak: `keep` before POLC's share of the gain is off it */
+    float slew, rms;     /* m: most that a command changes in a frame; of the whole command. INFINITY: no limit */
+    int64_t watchdog_ns; /* silence of the sensors after which a closed loop opens; 0: none */
     const float *offset, *limit;
     const float *reference, *alone_reference; /* R y_ref: of all epochs, and of the fallback */
     const srt_matrices *epochs;               /* (n_epochs), the newest exposure first */
@@ -74,13 +85,16 @@ typedef struct {
     int64_t frame, first_frame, answered;
     int64_t mirror_frame, mirror_frame_before;
     uint64_t token; /* of the program that runs; 0: none */
-    uint64_t opened_by_faults;
+    uint64_t opened_by_faults, opened_by_silence;
     float mirror_fraction;
+    float gain;                /* of the next frame; what the last was made with until it is prepared */
     uint32_t sensors, used, all_sensors;
-    uint32_t consecutive_holds, n_clipped;
+    uint32_t consecutive_holds, frames_closed; /* answered since the loop was closed */
+    uint32_t n_clipped, n_slewed;
+    int32_t scaled;            /* the whole command was made smaller */
     int32_t verdict;
-    int32_t closed;
-    atomic_int requested_closed;
+    int32_t closed, held_flat; /* which srt_loop_state, in two */
+    atomic_int requested;      /* srt_loop_state */
     uint32_t n_sensors, n_commands, n_rows, n_slopes, max_epochs;
     float *command, *state, *history; /* (n_rows), (n_rows), (SRT_HISTORY, n_rows) */
 
@@ -90,6 +104,7 @@ typedef struct {
     const srt_program *program;
     const srt_matrices *matrices; /* of the next frame: the newest epoch's, or the fallback's */
     bool several;                 /* earlier exposures are in the next command */
+    bool leaps;                   /* the answer heeds no slew limit */
     bool finite;                  /* the next frame's slopes so far are */
     int64_t whole;                /* of the delay, frames */
     float fraction;               /* of an exposure under the command `whole` frames before, when all is in time */
@@ -109,7 +124,7 @@ srt_loop *srt_loop_new(const uint32_t *n_subapertures, uint32_t n_sensors, uint3
 void srt_loop_free(srt_loop *loop);
 /* Share products with a crew, or NULL: with none. While the loop's thread does not run. */
 void srt_loop_use(srt_loop *loop, srt_crew *crew);
-void srt_loop_start(srt_loop *loop, int64_t frame, int closed);
+void srt_loop_start(srt_loop *loop, int64_t frame, int state);
 /* Before srt_loop_resume: an earlier exposure that was answered OK. slopes: (n_slopes) sensor by sensor, x then y. */
 void srt_loop_remember(srt_loop *loop, int64_t frame, const float *slopes, int64_t newest, int64_t before,
                        float fraction);
@@ -121,10 +136,18 @@ void srt_loop_add(srt_loop *loop, uint32_t sensor, const float *slopes);
 void srt_loop_multiply(srt_loop *loop, uint32_t sensor, uint32_t n);
 int srt_loop_answer(srt_loop *loop, int64_t newest, int64_t before, float fraction);
 int srt_loop_hold(srt_loop *loop, int verdict);
+/* The next frame's answer is the offset, at once and whatever came of its slopes: past the slew limit, since no command
+ * may follow. */
+int srt_loop_flatten(srt_loop *loop);
 /* The token of a program that was posted and is now never taken up, or 0. */
 uint64_t srt_loop_post(srt_loop *loop, const srt_program *program);
-void srt_loop_request(srt_loop *loop, int closed);
+void srt_loop_request(srt_loop *loop, int state);
 int srt_loop_pending(srt_loop *loop);
+
+static inline int srt_loop_state_of(const srt_loop *loop)
+{
+    return loop->closed ? SRT_CLOSED : loop->held_flat ? SRT_FLAT : SRT_RELAXES;
+}
 
 /* Where a sensor's slopes of a frame stand, in R's order. */
 static inline float *srt_loop_slopes(const srt_loop *loop, int64_t frame, uint32_t sensor)
@@ -157,7 +180,8 @@ typedef struct {
     uint64_t commands;
     uint64_t held_nonfinite, held_incomplete, held_missing, held_behind, held_history;
     uint64_t dropped_duplicate, dropped_late, dropped_session, dropped_fingerprint, dropped_malformed;
-    uint64_t clipped;
+    uint64_t clipped, slewed, scaled;
+    uint64_t fallback;     /* answered from one exposure, of a program of several */
     uint64_t changes_lost; /* nobody took them in time */
 } srt_counters;
 
@@ -166,20 +190,21 @@ enum { SRT_BINS_PER_OCTAVE = 16, SRT_OCTAVES = 24, SRT_BINS = SRT_BINS_PER_OCTAV
 /* Bins of 1/16 octave from 1 us; the first holds everything below too. */
 typedef struct {
     int64_t deadline_ns, misses, max_ns;
+    double sum, squares; /* of all, ns and ns^2 */
     int64_t counts[SRT_BINS];
 } srt_latency;
 
 void srt_latency_add(srt_latency *latency, int64_t ns);
 
 enum srt_what { SRT_SESSION, SRT_PROGRAM, SRT_LOOP };
-enum srt_reason { SRT_ASKED, SRT_FAULTS, SRT_NEW_SESSION, SRT_GOES_ON };
+enum srt_reason { SRT_ASKED, SRT_FAULTS, SRT_NEW_SESSION, SRT_GOES_ON, SRT_SILENCE };
 
 /* Something that the loop took up. */
 typedef struct {
     uint64_t session, token;
     int64_t frame;
-    int64_t number; /* for the reason: frames held in a row, or the frame that was due */
-    int32_t what, reason, closed;
+    int64_t number; /* for the reason: frames held in a row, the frame that was due, or ns without slopes */
+    int32_t what, reason, state;
 } srt_change;
 
 /* The loop after a frame: msgs_schema/msg/HrtcState. */
@@ -188,8 +213,8 @@ typedef struct {
     int64_t frame, first_frame;
     int32_t stamp_sec;
     uint32_t stamp_nanosec;
-    uint32_t consecutive_holds;
-    int32_t closed;
+    uint32_t consecutive_holds, frames_closed;
+    int32_t loop_state;
     float *state, *history; /* (n_rows), (SRT_HISTORY, n_rows) in the loop's order */
 } srt_snapshot;
 
@@ -201,7 +226,8 @@ typedef struct {
     uint64_t session;
     int64_t last_slopes_ns;
     srt_counters counters;
-    srt_latency latency;
+    srt_latency latency;       /* last slopes received to command published */
+    srt_latency frame_latency; /* first slopes received to command published */
     size_t largest_message; /* a SlopeFrame with every sensor, bytes; its frame_id takes at most 256 */
     srt_publish publish;
     void *publish_context;
@@ -214,7 +240,8 @@ srt_gate *srt_gate_new(const uint32_t *n_subapertures, uint32_t n_sensors, uint3
                        uint32_t max_epochs, const uint8_t fingerprint[32], int64_t deadline_ns, int64_t max_behind);
 void srt_gate_free(srt_gate *gate);
 void srt_gate_start(srt_gate *gate);
-/* The frame of a message that fits the instrument, used or not; -1: it does not. */
+/* The frame of a message that fits the instrument, used or not; -1: it does not. now_ns: when it was received. The message
+ * stays as it is until the next call of this or of srt_gate_advance has returned. */
 int64_t srt_gate_offer(srt_gate *gate, const uint8_t *message, size_t size, int64_t now_ns);
 void srt_gate_advance(srt_gate *gate);
 void srt_gate_idle(srt_gate *gate, int64_t now_ns);
@@ -229,6 +256,9 @@ const srt_snapshot *srt_gate_next_snapshot(srt_gate *gate);
 void srt_gate_snapshot_done(srt_gate *gate);
 
 int64_t srt_now(void); /* monotonic, ns */
+/* By the monotonic clock, when a message was received that the middleware stamped by the system's clock (0: not) and
+ * that was not there yet at `looked`: a step of the system's clock cannot be taken for more than the time since. */
+int64_t srt_received(int64_t stamp_ns, int64_t looked_ns);
 
 /* Sum of the mirrored structures' sizes; of srt_loop up to `posted`. */
 size_t srt_abi(void);

@@ -24,6 +24,7 @@ typedef struct {
     uint32_t in_order[SRT_MAX_SENSORS]; /* the first so many sub-apertures are there */
     uint32_t arrived;                   /* bit w: all of sensor w */
     bool begun;
+    int64_t first_ns;    /* when it began */
     int64_t complete_ns; /* when the last sensor became whole */
     srt_mirror mirror;   /* as the message with the first sub-aperture of all says, whatever came first */
     int32_t stamp_sec;   /* of the first message */
@@ -43,6 +44,11 @@ typedef struct {
 
 typedef struct {
     srt_gate shared; /* what others see stands first */
+    struct {
+        const uint8_t *message; /* NULL: none */
+        size_t size;
+        int64_t ns;
+    } unwritten; /* the message offered last, until there is time to put it into the ring */
     uint8_t fingerprint[32];
     uint32_t start[SRT_MAX_SENSORS + 1]; /* first sub-aperture of each sensor, then their total */
     int64_t max_behind;
@@ -65,6 +71,17 @@ int64_t srt_now(void)
     struct timespec now;
     clock_gettime(CLOCK_MONOTONIC, &now);
     return now.tv_sec * 1000000000ll + now.tv_nsec;
+}
+
+int64_t srt_received(int64_t stamp_ns, int64_t looked_ns)
+{
+    struct timespec system;
+    clock_gettime(CLOCK_REALTIME, &system);
+    int64_t now = srt_now();
+    if (stamp_ns <= 0)
+        return now;
+    int64_t received = now - (system.tv_sec * 1000000000ll + system.tv_nsec - stamp_ns);
+    return received < looked_ns ? looked_ns : received > now ? now : received;
 }
 
 /* -- little-endian CDR, which aligns from after the 4 bytes of encapsulation --------------------------------------- */
@@ -145,7 +162,7 @@ srt_gate *srt_gate_new(const uint32_t *n_subapertures, uint32_t n_sensors, uint3
     for (uint32_t w = 0; w < n_sensors; w++)
         g->start[w + 1] = g->start[w] + n_subapertures[w];
     g->max_behind = max_behind;
-    g->shared.latency.deadline_ns = deadline_ns;
+    g->shared.latency.deadline_ns = g->shared.frame_latency.deadline_ns = deadline_ns;
     g->shared.largest_message = HEADER + 256 + 8 + SLOPES_BODY + 4 * (size_t)loop->n_slopes + 4;
     g->fresh = true;
     g->newest = g->jumped_to = -1;
@@ -199,7 +216,8 @@ static void tell(gate *g, int what, int reason, int64_t number)
     }
     const srt_loop *loop = g->shared.loop;
     g->changes[in % CHANGES] = (srt_change){.session = g->shared.session, .token = loop->token, .frame = loop->frame,
-                                            .number = number, .what = what, .reason = reason, .closed = loop->closed};
+                                            .number = number, .what = what, .reason = reason,
+                                            .state = srt_loop_state_of(loop)};
     atomic_store_explicit(&g->changes_in, in + 1, memory_order_release);
 }
 
@@ -234,7 +252,8 @@ static void snapshot(gate *g, int32_t sec, uint32_t nanosec)
     s->stamp_sec = sec;
     s->stamp_nanosec = nanosec;
     s->consecutive_holds = loop->consecutive_holds;
-    s->closed = loop->closed;
+    s->frames_closed = loop->frames_closed;
+    s->loop_state = srt_loop_state_of(loop);
     memcpy(s->state, loop->state, loop->n_rows * sizeof(float));
     memcpy(s->history, loop->history, (size_t)SRT_HISTORY * loop->n_rows * sizeof(float));
     atomic_store_explicit(&g->snapshots_in, in + 1, memory_order_release);
@@ -257,6 +276,8 @@ void srt_latency_add(srt_latency *latency, int64_t ns)
 {
     int place = ns > 1000 ? (int)(SRT_BINS_PER_OCTAVE * log2((double)ns / 1000)) : 0;
     latency->counts[place < SRT_BINS ? place : SRT_BINS - 1]++;
+    latency->sum += (double)ns;
+    latency->squares += (double)ns * (double)ns;
     if (ns > latency->max_ns)
         latency->max_ns = ns;
     if (ns > latency->deadline_ns)
@@ -270,18 +291,24 @@ static exposure *exposure_of(gate *g, int64_t frame)
     return &g->exposures[frame % SRT_AHEAD];
 }
 
-static void prepare(gate *g)
+/* reason: why the loop may open now, if it was not asked to */
+static void prepare_for(gate *g, int reason, int64_t number)
 {
     srt_loop *loop = g->shared.loop;
     uint64_t token = loop->token;
-    int closed = loop->closed;
+    int state = srt_loop_state_of(loop);
     srt_loop_prepare(loop);
     if (loop->token != token)
         tell(g, SRT_PROGRAM, SRT_ASKED, 0);
-    if (loop->closed != closed) {
-        bool by_faults = closed && loop->consecutive_holds > loop->program->fault_budget;
-        tell(g, SRT_LOOP, by_faults ? SRT_FAULTS : SRT_ASKED, loop->consecutive_holds);
-    }
+    if (srt_loop_state_of(loop) != state)
+        tell(g, SRT_LOOP, reason, number);
+}
+
+static void prepare(gate *g)
+{
+    const srt_loop *loop = g->shared.loop;
+    bool by_faults = loop->closed && loop->consecutive_holds > loop->program->fault_budget;
+    prepare_for(g, by_faults ? SRT_FAULTS : SRT_ASKED, loop->consecutive_holds);
 }
 
 /* Form the products of what is here of the next frame, as far as sub-apertures are here in order. */
@@ -313,9 +340,9 @@ static size_t write_command(gate *g, const exposure *e, int64_t frame, const srt
     PUT(place, uint32_t, program ? program->settings : 0);
     PUT(place, uint32_t, loop->used);
     PUT(place, uint8_t, (uint8_t)loop->verdict);
-    PUT(place, uint8_t, (uint8_t)loop->closed);
+    PUT(place, uint8_t, (uint8_t)srt_loop_state_of(loop));
     PUT(place, uint16_t, (uint16_t)(loop->n_clipped < 65535 ? loop->n_clipped : 65535));
-    PUT(place, float, program ? program->gain : 0.0f);
+    PUT(place, float, program ? loop->gain : 0.0f);
     PUT(place, int64_t, loop->mirror_frame);
     PUT(place, int64_t, loop->mirror_frame_before);
     PUT(place, float, loop->mirror_fraction);
@@ -327,6 +354,16 @@ static size_t write_command(gate *g, const exposure *e, int64_t frame, const srt
     return g->command_size;
 }
 
+/* The message offered last into the ring; after what others wait for. */
+static void write_offered(gate *g)
+{
+    if (g->unwritten.message)
+        srt_ring_write(&g->shared.ring, SRT_SLOPES, g->unwritten.ns, g->unwritten.message, g->unwritten.size);
+    g->unwritten.message = NULL;
+}
+
+enum { FLATTEN = -1 }; /* in place of a verdict */
+
 static void answer_next(gate *g, int verdict)
 {
     srt_loop *loop = g->shared.loop;
@@ -335,7 +372,10 @@ static void answer_next(gate *g, int verdict)
     exposure *e = exposure_of(g, frame);
     int64_t since_ns = e->arrived == loop->all_sensors ? e->complete_ns : g->decided_ns;
     const srt_program *program = loop->program;
-    if (verdict == SRT_OK)
+    bool alone = program && program->n_epochs > 1 && !loop->several;
+    if (verdict == FLATTEN)
+        verdict = srt_loop_flatten(loop);
+    else if (verdict == SRT_OK)
         verdict = srt_loop_answer(loop, e->mirror.newest, e->mirror.before, e->mirror.fraction);
     else if (verdict == SRT_HOLD_MISSING && e->begun)
         verdict = srt_loop_hold(loop, SRT_HOLD_INCOMPLETE);
@@ -344,14 +384,22 @@ static void answer_next(gate *g, int verdict)
     size_t size = write_command(g, e, frame, program, since_ns);
     int failure = g->shared.publish ? g->shared.publish(g->shared.publish_context, g->command, size) : 0;
     int64_t out_ns = srt_now();
+    write_offered(g);
     if (!failure)
         srt_ring_write(&g->shared.ring, SRT_COMMANDS, out_ns, g->command, size);
     else if (!g->shared.failure)
         g->shared.failure = failure;
     srt_latency_add(&g->shared.latency, out_ns - since_ns);
+    if (e->begun)
+        srt_latency_add(&g->shared.frame_latency, out_ns - e->first_ns);
     counters->commands++;
     counters->clipped += loop->n_clipped;
+    counters->slewed += loop->n_slewed;
+    counters->scaled += (uint64_t)loop->scaled;
     switch (verdict) {
+    case SRT_OK:
+        counters->fallback += alone;
+        break;
     case SRT_HOLD_NONFINITE:
         counters->held_nonfinite++;
         break;
@@ -383,10 +431,9 @@ static void skip_next(gate *g)
     answer_next(g, loop->sensors == loop->all_sensors ? SRT_HOLD_BEHIND : SRT_HOLD_MISSING);
 }
 
-void srt_gate_advance(srt_gate *shared)
+static void advance(gate *g)
 {
-    gate *g = (gate *)shared;
-    const srt_loop *loop = shared->loop;
+    const srt_loop *loop = g->shared.loop;
     while (g->newest >= loop->frame) {
         if (g->newest - loop->frame > g->max_behind)
             skip_next(g);
@@ -397,6 +444,12 @@ void srt_gate_advance(srt_gate *shared)
         else
             return;
     }
+}
+
+void srt_gate_advance(srt_gate *shared)
+{
+    advance((gate *)shared);
+    write_offered((gate *)shared);
 }
 
 /* -- messages ------------------------------------------------------------------------------------------------------ */
@@ -425,11 +478,11 @@ static void begin(gate *g, uint64_t session, int64_t frame)
     /* a loop that was closed before any slopes came stays closed; a session after another starts with an open one */
     if (g->fresh)
         prepare(g);
-    int closed = loop->closed && g->fresh;
+    int state = g->fresh ? srt_loop_state_of(loop) : SRT_RELAXES;
     g->fresh = false;
     g->shared.session = session;
     g->newest = frame;
-    srt_loop_start(loop, frame, closed);
+    srt_loop_start(loop, frame, state);
     tell(g, SRT_SESSION, reason, due);
     prepare(g);
 }
@@ -446,7 +499,7 @@ static bool follows(gate *g, int64_t frame)
 }
 
 /* Put a message in its place; false, and nothing done, if any of it was here before. */
-static bool put(gate *g, exposure *e, const slope_frame *s)
+static bool put(gate *g, exposure *e, const slope_frame *s, int64_t now_ns)
 {
     srt_loop *loop = g->shared.loop;
     uint32_t start = g->start[s->sensor] + s->first;
@@ -455,6 +508,7 @@ static bool put(gate *g, exposure *e, const slope_frame *s)
     memset(e->filled + start, 1, s->n);
     if (!e->begun) {
         e->begun = true;
+        e->first_ns = now_ns;
         e->stamp_sec = s->stamp_sec;
         e->stamp_nanosec = s->stamp_nanosec;
     }
@@ -482,7 +536,7 @@ static void place(gate *g, const slope_frame *s, int64_t now_ns)
     int64_t frame = (int64_t)s->frame;
     exposure *e = exposure_of(g, frame);
     uint32_t before = e->arrived;
-    if (!put(g, e, s)) {
+    if (!put(g, e, s, now_ns)) {
         g->shared.counters.dropped_duplicate++;
         return;
     }
@@ -499,7 +553,10 @@ int64_t srt_gate_offer(srt_gate *shared, const uint8_t *message, size_t size, in
     gate *g = (gate *)shared;
     srt_counters *counters = &shared->counters;
     const srt_loop *loop = shared->loop;
-    srt_ring_write(&shared->ring, SRT_SLOPES, now_ns, message, size);
+    write_offered(g); /* the one before */
+    g->unwritten.message = message;
+    g->unwritten.size = size;
+    g->unwritten.ns = now_ns;
     slope_frame s;
     if (!read_slopes(message, size, &s)) {
         counters->dropped_malformed++;
@@ -544,13 +601,31 @@ void srt_gate_start(srt_gate *shared)
     take_up(g);
 }
 
+static void flatten(gate *g, int state, int reason, int64_t number)
+{
+    g->decided_ns = srt_now();
+    srt_loop_request(g->shared.loop, state);
+    prepare_for(g, reason, number);
+    answer_next(g, FLATTEN);
+}
+
 void srt_gate_idle(srt_gate *shared, int64_t now_ns)
 {
     gate *g = (gate *)shared;
     srt_loop *loop = shared->loop;
+    int64_t silence = now_ns - shared->last_slopes_ns;
     bool untouched = !exposure_of(g, loop->frame)->begun;
-    if (srt_loop_pending(loop) && (untouched || now_ns - shared->last_slopes_ns > STALLED))
+    if (srt_loop_pending(loop) && (untouched || silence > STALLED))
         take_up(g);
+    if (g->fresh || silence <= STALLED)
+        return;
+    int64_t watchdog = loop->program ? loop->program->watchdog_ns : 0;
+    if (loop->closed && watchdog && silence > watchdog) {
+        loop->opened_by_silence++;
+        flatten(g, SRT_RELAXES, SRT_SILENCE, silence);
+    } else if (loop->held_flat && srt_gate_not_flat(shared)) {
+        flatten(g, SRT_FLAT, SRT_ASKED, 0); /* no frame will do it */
+    }
 }
 
 int srt_gate_not_flat(const srt_gate *shared)
@@ -564,13 +639,7 @@ int srt_gate_not_flat(const srt_gate *shared)
 
 void srt_gate_flatten(srt_gate *shared)
 {
-    gate *g = (gate *)shared;
-    srt_loop *loop = shared->loop;
-    g->decided_ns = srt_now();
-    srt_loop_request(loop, 0);
-    memset(loop->state, 0, loop->n_rows * sizeof(float));
-    prepare(g);
-    answer_next(g, SRT_OPEN);
+    flatten((gate *)shared, SRT_RELAXES, SRT_ASKED, 0);
 }
 
 size_t srt_abi(void)

@@ -96,15 +96,17 @@ uint64_t srt_loop_post(srt_loop *loop, const srt_program *program)
     return before ? before->token : 0;
 }
 
-void srt_loop_request(srt_loop *loop, int closed)
+void srt_loop_request(srt_loop *loop, int state)
 {
-    atomic_store(&loop->requested_closed, closed);
+    atomic_store(&loop->requested, state);
 }
 
 int srt_loop_pending(srt_loop *loop)
 {
-    return atomic_load(&loop->posted) != NULL ||
-           (atomic_load(&loop->requested_closed) && loop->token) != (loop->closed != 0);
+    int requested = atomic_load(&loop->requested);
+    if (requested == SRT_CLOSED && !loop->token)
+        requested = SRT_RELAXES;
+    return atomic_load(&loop->posted) != NULL || requested != srt_loop_state_of(loop);
 }
 
 /* -- from the loop's thread --------------------------------------------------------------------------------------- */
@@ -123,16 +125,19 @@ static void no_sensor_came(srt_loop *loop)
     zero(loop->sums, (size_t)loop->n_sensors * loop->n_rows);
 }
 
-void srt_loop_start(srt_loop *loop, int64_t frame, int closed)
+void srt_loop_start(srt_loop *loop, int64_t frame, int state)
 {
     loop->frame = loop->first_frame = frame;
-    loop->closed = closed;
-    atomic_store(&loop->requested_closed, closed);
+    loop->closed = state == SRT_CLOSED;
+    loop->held_flat = state == SRT_FLAT;
+    atomic_store(&loop->requested, state);
     loop->consecutive_holds = 0;
+    loop->frames_closed = 0;
     loop->used = 0;
     loop->answered = -1;
     loop->verdict = SRT_OPEN;
-    loop->n_clipped = 0;
+    loop->n_clipped = loop->n_slewed = 0;
+    loop->scaled = 0;
     zero(loop->state, loop->n_rows);
     zero(loop->history, (size_t)SRT_HISTORY * loop->n_rows);
     srt_loop_forget(loop);
@@ -239,6 +244,17 @@ static void form_older(srt_loop *loop)
     }
 }
 
+/* The gain of the next frame, and what is kept of the state with it: both follow the ramp. */
+static float set_gain(srt_loop *loop)
+{
+    const srt_program *program = loop->program;
+    loop->gain = program->gain;
+    if (!loop->closed || loop->frames_closed + 1 >= program->ramp)
+        return program->keep;
+    loop->gain *= (float)(loop->frames_closed + 1) / (float)program->ramp;
+    return program->polc ? program->retained * (1.0f - loop->gain) : program->keep;
+}
+
 /* c, with what was on the mirror in this exposure. */
 static void expect(srt_loop *loop, srt_mirror mirror)
 {
@@ -260,7 +276,7 @@ static void expect(srt_loop *loop, srt_mirror mirror)
             q[i] += loop->older[i];
         reference = program->reference;
     }
-    float kept = program->keep, gain = program->gain, *restrict prepared = loop->prepared;
+    float kept = set_gain(loop), gain = loop->gain, *restrict prepared = loop->prepared;
     const float *state = loop->state;
     for (size_t i = 0; i < m; i++)
         prepared[i] = kept * state[i] + gain * (q[i] - reference[i]);
@@ -278,7 +294,11 @@ void srt_loop_prepare(srt_loop *loop)
         loop->program = posted;
         loop->token = posted->token;
     }
-    loop->closed = atomic_load(&loop->requested_closed) && loop->program;
+    int requested = atomic_load(&loop->requested);
+    if (requested == SRT_CLOSED && loop->program && !loop->closed)
+        loop->frames_closed = 0;
+    loop->closed = requested == SRT_CLOSED && loop->program;
+    loop->held_flat = requested == SRT_FLAT;
     no_sensor_came(loop);
     form_older(loop);
     expect_in_time(loop);
@@ -307,14 +327,14 @@ void srt_loop_add(srt_loop *loop, uint32_t sensor, const float *slopes)
 
 static void relax(srt_loop *loop)
 {
-    float share = 1.0f - loop->program->relaxation, *state = loop->state;
+    float share = loop->held_flat ? 0.0f : 1.0f - loop->program->relaxation, *state = loop->state;
     for (size_t i = 0; i < loop->n_rows; i++) {
         float value = state[i] * share;
         state[i] = fabsf(value) < 1e-12f ? 0.0f : value; /* a picometre: do not decay into denormals */
     }
 }
 
-/* m = clip(u + o), u = m - o where that changed anything. */
+/* m = clip(u + o); as below, u = m - o where that changed anything. */
 static void clip(srt_loop *loop)
 {
     const float *offset = loop->program->offset, *limit = loop->program->limit;
@@ -331,6 +351,53 @@ static void clip(srt_loop *loop)
     loop->n_clipped = clipped;
 }
 
+/* The whole command smaller, in the same shape, where its rms is above the limit. */
+static void scale(srt_loop *loop)
+{
+    enum { LANES = 8 }; /* n_rows is a multiple: a fixed order of summation on every machine */
+    float limit = loop->program->rms, *restrict command = loop->command;
+    loop->scaled = 0;
+    if (limit == INFINITY)
+        return;
+    double sums[LANES] = {0}, total = 0;
+    for (size_t i = 0; i < loop->n_rows; i += LANES)
+        for (int lane = 0; lane < LANES; lane++)
+            sums[lane] += (double)command[i + lane] * command[i + lane];
+    for (int lane = 0; lane < LANES; lane++)
+        total += sums[lane];
+    double rms = sqrt(total / loop->n_commands);
+    if (rms <= limit * (1 + 1e-6)) /* what was scaled before is not scaled again for its rounding */
+        return;
+    loop->scaled = 1;
+    float share = (float)(limit / rms), *restrict state = loop->state;
+    const float *offset = loop->program->offset;
+    for (size_t i = 0; i < loop->n_rows; i++) {
+        command[i] *= share;
+        state[i] = command[i] - offset[i];
+    }
+}
+
+/* No command further from the last than the limit. It has the last word: from one command within all limits to another,
+ * the rms may be above its own by as much as this limit. */
+static void slew(srt_loop *loop)
+{
+    float limit = loop->program->slew, *restrict command = loop->command, *restrict state = loop->state;
+    loop->n_slewed = 0;
+    if (limit == INFINITY || loop->leaps)
+        return;
+    const float *last = shown(loop, loop->frame - 1), *offset = loop->program->offset;
+    uint32_t slewed = 0;
+    for (size_t i = 0; i < loop->n_rows; i++) {
+        float wanted = command[i], low = last[i] - limit, high = last[i] + limit;
+        float m = wanted > high ? high : wanted < low ? low : wanted;
+        bool over = m != wanted;
+        state[i] = over ? m - offset[i] : state[i];
+        command[i] = m;
+        slewed += over;
+    }
+    loop->n_slewed = slewed;
+}
+
 static int finish(srt_loop *loop, int verdict)
 {
     const srt_program *program = loop->program;
@@ -342,11 +409,15 @@ static int finish(srt_loop *loop, int verdict)
         if (!loop->closed)
             relax(loop);
         clip(loop);
+        scale(loop);
+        slew(loop);
         if (loop->closed && loop->consecutive_holds > program->fault_budget) {
-            srt_loop_request(loop, 0);
+            srt_loop_request(loop, SRT_RELAXES);
             loop->opened_by_faults++;
         }
     }
+    if (loop->closed && loop->frames_closed < UINT32_MAX)
+        loop->frames_closed++;
     int64_t frame = loop->frame;
     copy(loop->history + (size_t)(frame % SRT_HISTORY) * loop->n_rows, loop->command, loop->n_rows);
     keep(loop, frame, verdict == SRT_OK,
@@ -384,7 +455,7 @@ int srt_loop_answer(srt_loop *loop, int64_t newest, int64_t before, float fracti
             expect(loop, (srt_mirror){newest, before, fraction});
     }
     size_t m = loop->n_rows;
-    float gain = program->gain, *restrict total = loop->product, *restrict trial = loop->trial;
+    float gain = loop->gain, *restrict total = loop->product, *restrict trial = loop->trial;
     const float *prepared = loop->prepared;
     zero(total, m);
     for (uint32_t w = 0; w < loop->n_sensors; w++)
@@ -400,4 +471,14 @@ int srt_loop_answer(srt_loop *loop, int64_t newest, int64_t before, float fracti
 int srt_loop_hold(srt_loop *loop, int verdict)
 {
     return finish(loop, verdict);
+}
+
+int srt_loop_flatten(srt_loop *loop)
+{
+    zero(loop->state, loop->n_rows);
+    loop->sensors = 0;
+    loop->leaps = true;
+    int verdict = finish(loop, SRT_OPEN);
+    loop->leaps = false;
+    return verdict;
 }

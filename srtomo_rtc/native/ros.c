@@ -44,30 +44,35 @@ static rcl_ret_t block(rcl_wait_set_t *waiting, const srt_ros *ros)
     return result == RCL_RET_TIMEOUT ? RCL_RET_OK : result;
 }
 
-/* Offer all that has come; whether anything had. */
-static rcl_ret_t take_all(srt_gate *gate, srt_ros *ros, rcl_serialized_message_t *message, bool *came)
+/* Offer all that has come; whether anything had. looked: when there was nothing last, and then when there is nothing.
+ * One message's time is later than another's that was taken before it: the recorder keeps them in that order. */
+static rcl_ret_t take_all(srt_gate *gate, srt_ros *ros, rcl_serialized_message_t *message, int64_t *looked, bool *came)
 {
     rmw_message_info_t info;
     rcl_ret_t result;
     *came = false;
+    int64_t look = srt_now();
     while ((result = rcl_take_serialized_message(ros->slopes, message, &info, NULL)) == RCL_RET_OK) {
         *came = true;
-        int64_t frame = srt_gate_offer(gate, message->buffer, message->buffer_length, srt_now());
+        *looked = srt_received(info.received_timestamp, *looked) + 1;
+        int64_t frame = srt_gate_offer(gate, message->buffer, message->buffer_length, *looked);
         if (frame >= 0 && ros->received_count < ros->received_room) {
             ros->received[2 * ros->received_count] = frame;
             ros->received[2 * ros->received_count++ + 1] = info.received_timestamp;
         }
+        look = srt_now();
     }
+    *looked = look > *looked ? look : *looked;
     return result == RCL_RET_SUBSCRIPTION_TAKE_FAILED ? RCL_RET_OK : result;
 }
 
 static rcl_ret_t run(srt_gate *gate, srt_ros *ros, rcl_wait_set_t *waiting, rcl_serialized_message_t *message)
 {
     srt_gate_start(gate);
-    int64_t last = srt_now();
+    int64_t last = srt_now(), looked = last;
     while (!atomic_load_explicit(&gate->stop, memory_order_acquire)) {
         bool came;
-        rcl_ret_t result = take_all(gate, ros, message, &came);
+        rcl_ret_t result = take_all(gate, ros, message, &looked, &came);
         if (result != RCL_RET_OK)
             return result;
         srt_gate_advance(gate);

@@ -1,8 +1,9 @@
 import numpy as np
 import pytest
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from srtomo_core import wire
-from srtomo_core.messages import MessageError, decode, definition, encode, message_types
+from srtomo_core.messages import MessageError, decode, decode_recorded, definition, encode, message_types
 
 
 def test_every_topic_of_the_wire_has_a_definition():
@@ -73,3 +74,25 @@ def test_what_is_no_message_is_refused_in_one_line(call, news):
     with pytest.raises(MessageError, match=news) as caught:
         call()
     assert "\n" not in str(caught.value)
+
+
+def test_a_message_of_an_older_definition_lacks_what_is_new():
+    """Fields added since, at the end or before it, are zero or empty."""
+    text = definition(wire.EVENT.type)
+    older = [
+        line
+        for line in text.splitlines()
+        if not line.startswith(("float32 watchdog", "uint32 gain_ramp", "string kernel"))
+    ]
+    store = get_typestore(Stores.ROS2_JAZZY)
+    store.register(get_types_from_msg("\n".join(older), wire.EVENT.type))
+    new = decode(wire.EVENT.type, encode(wire.EVENT.type, kind=2, offset=[1, 2], slew_limit=3.0))
+    fields = {name: value for name, value in vars(new).items() if name not in ("watchdog", "gain_ramp", "kernel")}
+    data = bytes(store.serialize_cdr(store.types[wire.EVENT.type](**fields), wire.EVENT.type))
+    read = decode_recorded(wire.EVENT.type, data, "\n".join(older))
+    assert (read.kind, read.offset.tolist(), read.slew_limit) == (2, [1.0, 2.0], 3.0)
+    assert (read.watchdog, read.gain_ramp, read.kernel) == (0, 0, "")
+    with pytest.raises(MessageError, match="as recorded"):
+        decode_recorded(wire.EVENT.type, data[:50], "\n".join(older))
+    with pytest.raises(MessageError, match="as recorded"):
+        decode_recorded(wire.EVENT.type, data, "no definition")

@@ -10,7 +10,6 @@ import pytest
 
 from srtomo_core import wire
 from srtomo_core.bag import BagReader, BagWriter
-from srtomo_core.messages import decode
 from srtomo_rtc.loop import Verdict
 from srtomo_rtc.replay import Outcome, Replay
 
@@ -27,6 +26,7 @@ def replay(path: Path, start: int = 0) -> Outcome:
 def rewritten(path: Path, topic: wire.Topic, change) -> Path:
     """A copy of the bag with the messages of a topic that ``change(index, data)`` returns in their place."""
     with BagReader(BAG) as reader, BagWriter(path, reader.metadata) as writer:
+        writer.declare_as(reader)
         index = 0
         for message in reader:
             data = message.data
@@ -46,8 +46,8 @@ def test_it_holds_what_it_is_for() -> None:
     assert sum(file.stat().st_size for file in BAG.iterdir()) < 800_000
     with BagReader(BAG) as reader:
         commands = [wire.read_dm_command(m.data) for m in reader.messages(reader.topic(wire.COMMAND.name))]
-        events = [decode(m.type, m.data) for m in reader.messages(reader.topic(wire.EVENT.name))]
-        states = [decode(m.type, m.data).frame for m in reader.messages(reader.topic(wire.STATE.name))]
+        events = [reader.decode(m) for m in reader.messages(reader.topic(wire.EVENT.name))]
+        states = [reader.decode(m).frame for m in reader.messages(reader.topic(wire.STATE.name))]
     assert [command.frame for command in commands] == list(range(FRAMES))
     verdicts = Counter(Verdict(command.verdict).name for command in commands)
     assert verdicts["HOLD_NONFINITE"] == verdicts["HOLD_INCOMPLETE"] == 1

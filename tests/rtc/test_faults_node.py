@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import time
 from collections.abc import Sequence
 from contextlib import contextmanager
@@ -26,7 +27,9 @@ from lifecycle_msgs.srv import ChangeState
 from msgs_schema.msg import DmCommand, HrtcEvent, SlopeFrame
 from msgs_schema.msg import Reconstructor as ReconstructorMsg
 from msgs_schema.msg import ReconstructorBlock as ReconstructorBlockMsg
+from rcl_interfaces.srv import SetParameters
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
 
 from srtomo_ops.operator import Operator, OperatorError
@@ -211,6 +214,12 @@ class Wire:
         self.operator.destroy_node()
 
 
+def set_parameters(loop: Wire, **values: float) -> None:
+    changes = [Parameter(name, value=value).to_parameter_msg() for name, value in values.items()]
+    response = loop.operator.call(SetParameters, "hrtc/set_parameters", SetParameters.Request(parameters=changes))
+    assert all(result.successful for result in response.results)
+
+
 @pytest.fixture(scope="module")
 def matrix_file(tmp_path_factory, mini):
     path = tmp_path_factory.mktemp("faults") / "g.npz"
@@ -296,7 +305,6 @@ def test_sensors_that_stall(loop):
     k = loop.next
     loop.send(*loop.messages(k)[:2])  # in the middle of a frame
     assert loop.status(lambda status: status.silence > 1.5).loop_state == HrtcEvent.CLOSED
-    # in later tests the diagnostics say that the loop once opened by itself
     assert loop.diagnosis("no slopes for") == 1
     with loop.counting():
         loop.send(*loop.messages(k)[2:])
@@ -328,6 +336,39 @@ def test_slopes_that_stay_not_finite_open_the_loop(loop):
     assert loop.diagnosis("the loop opened by itself") == 2
     held, flat = (np.abs(command.commands).max() for command in (loop.commands[-101], loop.commands[-1]))
     assert flat == pytest.approx(held * 0.9**100, rel=1e-3)
+    loop.operator.close_loop(True)
+    loop.run(5)
+    assert loop.diagnosis("closed") < 2  # it happened, and is over
+
+
+def test_sensors_that_fall_silent_for_good(loop):
+    """The watchdog opens the loop and leaves the mirror flat; what comes of the frame after that is late."""
+    since, k = len(loop.events), loop.next
+    before = loop.status().loop_opened_by_silence
+    set_parameters(loop, watchdog=0.5)
+    assert np.abs(loop.commands[-1].commands).max() > 0
+    parts = loop.messages(k)
+    loop.send(*parts[:2])
+    assert loop.answered(k) == [Verdict.OPEN]
+    assert not loop.commands[-1].commands.any() and loop.commands[-1].sensors == 0
+    assert re.fullmatch(r"no slopes for 0\.\d s", loop.event(HrtcEvent.LOOP, since).text)
+    assert loop.status(lambda status: status.loop_opened_by_silence > before).loop_opened_by_silence == before + 1
+    assert loop.diagnosis("the loop opened by itself: no slopes for") == 2
+    with loop.counting(dropped_late=2):
+        loop.send(*parts[2:])
+        assert loop.run(2) == [Verdict.OPEN] * 2
+    set_parameters(loop, watchdog=10.0)
+
+
+def test_a_manual_flat(loop):
+    since = len(loop.events)
+    assert np.abs(loop.commands[-1].commands).max() > 0
+    loop.operator.flatten()
+    assert loop.run(2) == [Verdict.OPEN] * 2
+    assert [command.loop_state for command in loop.commands[-2:]] == [HrtcEvent.FLAT] * 2
+    assert not loop.commands[-2].commands.any()
+    assert loop.event(HrtcEvent.LOOP, since).loop_state == HrtcEvent.FLAT
+    assert loop.status().loop_state == HrtcEvent.FLAT
 
 
 def test_duplicates_and_late_frames(loop):

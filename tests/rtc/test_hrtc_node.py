@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import time
 from contextlib import suppress
@@ -244,6 +245,10 @@ def test_every_frame_is_answered_once_and_in_order(finished):
     assert (status.commands, status.held_missing + status.held_incomplete + status.held_behind) == (FRAMES, 0)
     assert status.dropped_malformed == status.dropped_session == status.dropped_late == 0
     assert 0 < status.latency_p50 <= status.latency_p99 <= status.latency_max
+    assert status.latency_p50 <= status.frame_latency_p50 <= status.frame_latency_max
+    assert min(status.latency_std, status.frame_latency_std) > 0
+    assert 0 < math.hypot(status.offload_tip, status.offload_tilt) < 1e-5
+    assert status.changes_lost == status.fallback == status.loop_opened_by_silence == 0
 
 
 def test_commands_are_those_of_the_loop_in_lockstep_bit_for_bit(finished):

@@ -1,8 +1,11 @@
 """The histogram of latencies."""
 
+import time
+
 import numpy as np
 import pytest
 
+from srtomo_rtc import native
 from srtomo_rtc.latency import LatencyHistogram
 
 
@@ -17,12 +20,25 @@ def test_quantiles_of_many_latencies():
         assert exact <= histogram.quantile(share) <= exact * 2 ** (1 / 16) * 1.0001
     assert histogram.quantile(1.0) == values.max() * 1e-9 == histogram.max_ns * 1e-9
     assert histogram.misses == (values > 400_000).sum()
+    assert histogram.std == pytest.approx(values.std() * 1e-9, rel=1e-9)
     assert histogram.counts.sum() == len(values)
 
 
 def test_nothing_was_counted():
     histogram = LatencyHistogram(1000)
-    assert (histogram.quantile(0.5), histogram.max_ns, histogram.misses) == (0.0, 0, 0)
+    assert (histogram.quantile(0.5), histogram.std, histogram.max_ns, histogram.misses) == (0.0, 0.0, 0, 0)
+
+
+def test_a_stamp_of_the_system_s_clock_by_the_monotonic_one():
+    """Never before nothing was there nor after now, whatever the system's clock does; without a stamp it is now."""
+    received = native.lib.srt_received
+    for ago in (10**8, -(10**12), None):
+        before, stamp = time.monotonic_ns(), 0 if ago is None else time.time_ns() - ago
+        found, after = received(stamp, before - 10**9), time.monotonic_ns()
+        early, late = (ago - 10**6, ago + 10**6) if ago == 10**8 else (0, 0)  # two clocks are read
+        assert before - late <= found <= after - early
+    looked = time.monotonic_ns() - 10**6
+    assert received(time.time_ns() - 10**12, looked) == looked  # the clock was set forward meanwhile
 
 
 @pytest.mark.parametrize("latency", [-5, 0, 1, 999, 1000, 1001, 10**9, 10**12, 10**18])
