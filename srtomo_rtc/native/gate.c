@@ -54,6 +54,7 @@ typedef struct {
     int64_t max_behind;
     bool fresh;
     int64_t newest, jumped_to, decided_ns;
+    int64_t closed_ns; /* when the loop was last closed while nothing came */
     exposure exposures[SRT_AHEAD];
     uint32_t used[RECENT];
     uint8_t *command; /* the serialised DmCommand, written again and again */
@@ -615,12 +616,16 @@ void srt_gate_idle(srt_gate *shared, int64_t now_ns)
     srt_loop *loop = shared->loop;
     int64_t silence = now_ns - shared->last_slopes_ns;
     bool untouched = !exposure_of(g, loop->frame)->begun;
-    if (srt_loop_pending(loop) && (untouched || silence > STALLED))
+    if (srt_loop_pending(loop) && (untouched || silence > STALLED)) {
+        bool closed = loop->closed;
         take_up(g);
+        if (loop->closed && !closed)
+            g->closed_ns = now_ns; /* the sensors have from now on the watchdog's time to come back */
+    }
     if (g->fresh || silence <= STALLED)
         return;
     int64_t watchdog = loop->program ? loop->program->watchdog_ns : 0;
-    if (loop->closed && watchdog && silence > watchdog) {
+    if (loop->closed && watchdog && silence > watchdog && now_ns - g->closed_ns > watchdog) {
         loop->opened_by_silence++;
         flatten(g, SRT_RELAXES, SRT_SILENCE, silence);
     } else if (loop->held_flat && srt_gate_not_flat(shared)) {

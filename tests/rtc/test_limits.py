@@ -231,7 +231,11 @@ def test_a_silence_opens_a_closed_loop_and_leaves_the_static_shape(closed):
     assert (loop.opened_by_silence, loop.opened_by_faults) == (1, 0)
     closed.run(range(21, 24))
     assert [command.verdict for command in closed.commands[21:]] == [Verdict.OPEN] * 3
+    closed.now += 100 * SECOND  # closed while they are silent, it waits for them anew
     request(closed, LoopState.CLOSED)
+    closed.now += SECOND
+    closed.hrtc.idle(closed.now)
+    assert loop.closed
     closed.run(range(24, 26))
     assert [command.verdict for command in closed.commands[24:]] == [Verdict.OK] * 2
 
