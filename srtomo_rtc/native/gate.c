@@ -599,6 +599,7 @@ void srt_gate_start(srt_gate *shared)
 {
     gate *g = (gate *)shared;
     g->fresh = true;
+    g->unwritten.message = NULL;
     take_up(g);
 }
 

@@ -44,15 +44,24 @@ static rcl_ret_t block(rcl_wait_set_t *waiting, const srt_ros *ros)
     return result == RCL_RET_TIMEOUT ? RCL_RET_OK : result;
 }
 
+/* In turns: the gate still looks at the message before. */
+typedef struct {
+    rcl_serialized_message_t messages[2];
+    int next;
+} inlet;
+
 /* Offer all that has come; whether anything had. looked: when there was nothing last, and then when there is nothing.
  * One message's time is later than another's that was taken before it: the recorder keeps them in that order. */
-static rcl_ret_t take_all(srt_gate *gate, srt_ros *ros, rcl_serialized_message_t *message, int64_t *looked, bool *came)
+static rcl_ret_t take_all(srt_gate *gate, srt_ros *ros, inlet *in, int64_t *looked, bool *came)
 {
     rmw_message_info_t info;
     rcl_ret_t result;
     *came = false;
     int64_t look = srt_now();
-    while ((result = rcl_take_serialized_message(ros->slopes, message, &info, NULL)) == RCL_RET_OK) {
+    rcl_serialized_message_t *message;
+    while ((result = rcl_take_serialized_message(ros->slopes, message = &in->messages[in->next], &info, NULL)) ==
+           RCL_RET_OK) {
+        in->next = !in->next;
         *came = true;
         *looked = srt_received(info.received_timestamp, *looked) + 1;
         int64_t frame = srt_gate_offer(gate, message->buffer, message->buffer_length, *looked);
@@ -66,13 +75,13 @@ static rcl_ret_t take_all(srt_gate *gate, srt_ros *ros, rcl_serialized_message_t
     return result == RCL_RET_SUBSCRIPTION_TAKE_FAILED ? RCL_RET_OK : result;
 }
 
-static rcl_ret_t run(srt_gate *gate, srt_ros *ros, rcl_wait_set_t *waiting, rcl_serialized_message_t *message)
+static rcl_ret_t run(srt_gate *gate, srt_ros *ros, rcl_wait_set_t *waiting, inlet *in)
 {
     srt_gate_start(gate);
     int64_t last = srt_now(), looked = last;
     while (!atomic_load_explicit(&gate->stop, memory_order_acquire)) {
         bool came;
-        rcl_ret_t result = take_all(gate, ros, message, &looked, &came);
+        rcl_ret_t result = take_all(gate, ros, in, &looked, &came);
         if (result != RCL_RET_OK)
             return result;
         srt_gate_advance(gate);
@@ -98,8 +107,9 @@ int srt_run(srt_gate *gate, srt_ros *ros)
     if (result != RCL_RET_OK)
         return result;
     /* room for every message that fits: the middleware then has nothing to allocate for it */
-    rcl_serialized_message_t message = rmw_get_zero_initialized_serialized_message();
-    result = rmw_serialized_message_init(&message, gate->largest_message, &allocator);
+    inlet in = {{rmw_get_zero_initialized_serialized_message(), rmw_get_zero_initialized_serialized_message()}, 0};
+    for (int i = 0; i < 2 && result == RCL_RET_OK; i++)
+        result = rmw_serialized_message_init(&in.messages[i], gate->largest_message, &allocator);
     if (result == RCL_RET_OK) {
         outlet out = {.publisher = ros->commands};
         out.message.allocator = allocator;
@@ -107,7 +117,7 @@ int srt_run(srt_gate *gate, srt_ros *ros)
         void *context = gate->publish_context;
         gate->publish = publish;
         gate->publish_context = &out;
-        result = run(gate, ros, &waiting, &message);
+        result = run(gate, ros, &waiting, &in);
         if (result == RCL_RET_OK && srt_gate_not_flat(gate)) {
             srt_gate_flatten(gate);
             result = gate->failure;
@@ -115,9 +125,11 @@ int srt_run(srt_gate *gate, srt_ros *ros)
         gate->publish = before;
         gate->publish_context = context;
         gate->failure = 0;
-        if (rmw_serialized_message_fini(&message) != RMW_RET_OK && result == RCL_RET_OK)
-            result = RCL_RET_ERROR;
     }
+    for (int i = 0; i < 2; i++)
+        if (in.messages[i].buffer && rmw_serialized_message_fini(&in.messages[i]) != RMW_RET_OK &&
+            result == RCL_RET_OK)
+            result = RCL_RET_ERROR;
     if (rcl_wait_set_fini(&waiting) != RCL_RET_OK && result == RCL_RET_OK)
         result = RCL_RET_ERROR;
     return result;
