@@ -11,7 +11,8 @@ unexport AMENT_PREFIX_PATH CMAKE_PREFIX_PATH LD_LIBRARY_PATH PYTHONPATH RMW_IMPL
 help:
 	@echo 'make demo [ARGS=...]   run the demo (srtomo demo)'
 	@echo 'make test [ARGS=...]   run the tests; test-slow: the long ones'
-	@echo 'make rival             install pyTomoAO into build/rival, and time the same work against it'
+	@echo 'make rival             install pyTomoAO and pyRTC into build, and time the same work against them'
+	@echo 'make soak              a million frames of gnao_ltao_sr with swaps and faults, each checked: 40 minutes at most'
 	@echo 'make lint              ruff and mypy'
 	@echo 'make install           only install into $(VENV), as all of the above do first'
 	@echo 'make clean             remove $(VENV) and what the tools left'
@@ -31,6 +32,13 @@ rival: install
 	build/rival/bin/pip install -q pyTomoAO==2.0.0
 	OPENBLAS_NUM_THREADS=1 SRTOMO_RIVAL_PYTHON=$(CURDIR)/build/rival/bin/python \
 		$(BIN)/python -m pytest -m slow -s tests/ops/test_rival_pytomoao.py $(ARGS)
+	[ -x build/rival_pyrtc/bin/pip ] || $(PYTHON) -m venv build/rival_pyrtc
+	build/rival_pyrtc/bin/pip install -q pyrtcao==2.1.0
+	OPENBLAS_NUM_THREADS=1 SRTOMO_PYRTC_PYTHON=$(CURDIR)/build/rival_pyrtc/bin/python \
+		$(BIN)/python -m pytest -m slow tests/ops/test_rival_pyrtc.py $(ARGS)
+
+soak: install
+	$(BIN)/srtomo bench soak gnao_ltao_sr --json soak.json $(ARGS)
 
 lint: install
 	$(BIN)/ruff check .
@@ -65,4 +73,4 @@ $(STAMP): pyproject.toml $(shell find msgs_schema srtomo_rtc/native) $(if $(filt
 	@echo ' done'; echo '$(PYTHON)' >$@
 
 FORCE:
-.PHONY: help demo test test-slow rival lint clean missing install FORCE
+.PHONY: help demo test test-slow rival soak lint clean missing install FORCE

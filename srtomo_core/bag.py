@@ -72,6 +72,7 @@ class _FileWriter:
         self.counts: Counter[str] = Counter()
         self.first_time = _EMPTY_START
         self.last_time = 0
+        self._final_bytes: int | None = None
         self._schemas: dict[str, int] = {}
         self._channels: dict[str, int] = {}
         self._file: IO[bytes] = open(path, "xb")
@@ -86,7 +87,8 @@ class _FileWriter:
 
     @property
     def bytes(self) -> int:
-        return os.path.getsize(self.path)
+        # a finished file may be moved away or deleted while the recording goes on
+        return os.path.getsize(self.path) if self._final_bytes is None else self._final_bytes
 
     def declare(self, topic: str, written: _WrittenTopic) -> None:
         name = written.type_name
@@ -111,6 +113,7 @@ class _FileWriter:
         self._file.flush()
         os.fsync(self._file.fileno())
         self._file.close()
+        self._final_bytes = os.path.getsize(self.path)
 
     def abort(self) -> None:
         # closing writes what is buffered, and so fails again on a full disk
@@ -271,7 +274,7 @@ class BagWriter:
             self.removed_bytes += oldest.bytes
             # a reader that goes by metadata.yaml must never look for a file that is gone
             self._write_yaml()
-            oldest.path.unlink()
+            oldest.path.unlink(missing_ok=True)
 
     def close(self) -> None:
         """Write the index and the final ``metadata.yaml``. A second call does nothing."""

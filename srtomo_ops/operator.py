@@ -72,6 +72,10 @@ class Operator(Node):
         while (left := end - time.monotonic()) > 0:
             self._executor.spin_once(timeout_sec=left)
 
+    def poll(self) -> None:
+        """Take one message or answer, if any waits."""
+        self._executor.spin_once(timeout_sec=0.0)
+
     def call(self, kind: Any, service: str, request: Any, timeout: float = 10.0) -> Any:
         """Call a service.
 

@@ -39,6 +39,11 @@ class Processes:
                 env={**os.environ, "PYTHONUNBUFFERED": "1"},
             )
 
+    def resident_bytes(self, name: str) -> int:
+        """Memory that a node holds now: its own and what it shares."""
+        pages = Path(f"/proc/{self._running[name].pid}/statm").read_text().split()[1]
+        return int(pages) * os.sysconf("SC_PAGE_SIZE")
+
     def log(self, name: str) -> Path:
         """A node's output."""
         return self._folder / f"{name}.log"

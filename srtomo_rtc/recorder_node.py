@@ -46,7 +46,7 @@ from srtomo_rtc.ledger import Ledger
 from srtomo_rtc.ring_source import Recent, RingSource
 
 _HOT_PERIOD = 0.01  # s between visits to the topics of every frame
-_SLOW_VISITS = 10  # the other topics are visited at every tenth of those
+_SLOW_PERIOD = 0.1  # s between visits to the others, however long those take
 _LEAST_DEPTH = 16  # messages, of the slow topics' readers
 _STATUS_PERIOD = 0.5  # s
 _FLUSH_PERIOD = 1.0  # s: what a killed recorder loses at the most, when messages are rare
@@ -229,12 +229,13 @@ class Recorder:
             raise self._scribe.error
 
     def _record(self, stop: threading.Event) -> None:
-        visit = 0
-        status_at = time.monotonic()
+        slow_at = status_at = time.monotonic()
         while not stop.is_set() and self._scribe.error is None:
             if self._scribe.waiting_bytes < _WAITING_BYTES:
-                self._drain(self._taps if visit % _SLOW_VISITS == 0 else self._hot)
-                visit += 1
+                slow = time.monotonic() >= slow_at
+                if slow:
+                    slow_at = time.monotonic() + _SLOW_PERIOD
+                self._drain(self._taps if slow else self._hot)
             if time.monotonic() >= status_at:
                 self._publish_status()
                 status_at = time.monotonic() + _STATUS_PERIOD
@@ -271,8 +272,10 @@ class Recorder:
 
     def _take_ring(self) -> list[_Record]:
         before = self._ring.attached, self._ring.overruns
-        messages = self._ring.read(self._ring_wanted)
+        # before it is read: a process that stood still in between would take the ring for quiet, and messages that are
+        # in it from their subscriptions, with later times
         now = time.monotonic()
+        messages = self._ring.read(self._ring_wanted)
         if messages:
             self._heard = now
         if before != (self._ring.attached, self._ring.overruns) or (self._ring.attached and now - self._heard > _QUIET):

@@ -33,6 +33,7 @@ MAY_IMPORT_ROS = (
     "srtomo_ops/commands/bench.py",  # asks whether it is there
     "srtomo_ops/bench/path.py",
     "srtomo_ops/bench/path_node.py",
+    "srtomo_ops/bench/soak_drive.py",
 )
 WITHOUT_ROS = [name for name in PACKAGES if name != "srtomo_ops"]
 

@@ -277,7 +277,7 @@ def measure_compute(problem: Problem, frames: int) -> Compute:
         ValueError: a command is missing or wrong, or a kernel's product is.
     """
     period = round(1e9 / problem.system.loop.rate)
-    loop = _LoopHere(problem, period)
+    loop = LoopHere(problem, period)
     kernels = _kernels(problem, period)
     samples: dict[str, list[int]] = {name: [] for name in (*ARRIVALS, *kernels)}
     left = frames
@@ -297,7 +297,7 @@ def measure_compute(problem: Problem, frames: int) -> Compute:
     )
 
 
-class _LoopHere:
+class LoopHere:
     """The HRTC's frame gate and loop on this thread."""
 
     def __init__(self, problem: Problem, period: int) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from srtomo_core.reconstructor import Reconstructor
-from srtomo_ops.bench import latency
+from srtomo_ops.bench import latency, soak
 from srtomo_ops.bench.latency_report import numbers, report
 from srtomo_ops.bench.reconstruct import measure
 from srtomo_ops.options import add_json, add_system, changes_of, system_of, write_json
@@ -21,9 +21,11 @@ if TYPE_CHECKING:
 EXAMPLE = """examples:
   srtomo bench reconstruct gnao_ltao_sr
   srtomo bench reconstruct mavis --threads 2 --json mavis.json
-  srtomo bench latency gnao_ltao_sr --json latency.json"""
+  srtomo bench latency gnao_ltao_sr --json latency.json
+  srtomo bench soak gnao_ltao_sr --frames 20000"""
 
 _GIB = 2**30
+_FRAMES = {"latency": 250, "soak": 1_000_000}
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -31,8 +33,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "what",
         metavar="WHAT",
-        choices=("reconstruct", "latency"),
-        help="reconstruct: build a reconstructor; latency: slopes to command",
+        choices=("reconstruct", "latency", "soak"),
+        help="reconstruct: build a reconstructor; latency: slopes to command; soak: a million frames with swaps and "
+        "faults, each checked",
     )
     add_system(parser, default="gnao_ltao_sr")
     cores = len(os.sched_getaffinity(0))
@@ -42,7 +45,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--exact", action="store_true", help="float64, nothing interpolated (default: as fast as it goes)"
     )
     loop = parser.add_argument_group("latency")
-    loop.add_argument("--frames", type=int, default=250, help="of one turn (default: 250)")
+    loop.add_argument(
+        "--frames", type=int, help=f"of one turn (default: {_FRAMES['latency']}); of a soak: all ({_FRAMES['soak']})"
+    )
     loop.add_argument("--pairs", type=int, default=10, help="of turns, HRTC and echo, of each arrival (default: 10)")
     loop.add_argument("--packets", type=int, default=4, help="a sensor and frame when staggered (default: 4)")
     loop.add_argument("--fifo-priority", type=int, default=0, help="SCHED_FIFO of both nodes (default: 0, none)")
@@ -50,12 +55,18 @@ def configure(parser: argparse.ArgumentParser) -> None:
     loop.add_argument(
         "--reconstructor", metavar="FILE", type=Path, help="to run (default: least squares, of the same size)"
     )
+    long = parser.add_argument_group("soak")
+    long.add_argument("--swap-every", metavar="N", type=int, default=1000, help="frames (default: 1000)")
+    long.add_argument("--split", metavar="MB", type=float, default=500.0, help="size of a recorded file (default: 500)")
+    long.add_argument("--folder", metavar="DIR", type=Path, help="for recording and logs (default: a temporary one)")
     add_json(parser)
 
 
 def main(options: argparse.Namespace) -> int:
-    """Run the command; exit code 1 if a latency is above its target."""
-    return _latency(options) if options.what == "latency" else _reconstruct(options)
+    """Run the command; exit code 1 if a target is missed."""
+    if options.frames is None:
+        options.frames = _FRAMES.get(options.what)
+    return {"latency": _latency, "soak": _soak, "reconstruct": _reconstruct}[options.what](options)
 
 
 def _reconstruct(options: argparse.Namespace) -> int:
@@ -132,3 +143,31 @@ def _paths(options: argparse.Namespace, problem: latency.Problem) -> Paths:
             Path(folder),
             options.fifo_priority,
         )
+
+
+def _soak(options: argparse.Namespace) -> int:
+    for name, least in (("frames", 200), ("swap_every", 20)):
+        if getattr(options, name) < least:
+            raise ValueError(f"--{name.replace('_', '-')}: expected at least {least}, got {getattr(options, name)}")
+    from domain_coordinator import domain_id
+
+    system = system_of(options)
+    with (
+        domain_id() as domain,
+        tempfile.TemporaryDirectory(prefix="srtomo-soak-", dir=options.folder) as folder,
+        Progress("soak") as progress,
+    ):
+        os.environ["ROS_DOMAIN_ID"] = str(domain)
+        found = soak.soak(
+            system,
+            options.system,
+            changes_of(options),
+            options.frames,
+            Path(folder),
+            options.swap_every,
+            options.split,
+            progress=progress.share,
+        )
+    print("\n".join(soak.lines(found, system)))
+    write_json(options.json, {"system": system.name, **soak.numbers(found)})
+    return 0 if found.flat else 1

@@ -392,6 +392,22 @@ def test_a_limit_removes_the_oldest_and_leaves_what_a_late_reader_needs(tmp_path
     assert sorted(information["relative_file_paths"]) == [file.name for file in files]
 
 
+def test_finished_files_may_be_deleted_meanwhile(tmp_path, small_chunks):
+    """Somebody else makes room: the recording goes on, counts what it wrote, and keeps within its limit."""
+    path = tmp_path / "night"
+    with BagWriter(path, {}, split_bytes=20_000, limit_bytes=60_000) as writer:
+        for frame in range(600):
+            writer.write(SLOPES, wire.SLOPES.type, slope_frame(frame), START + frame, START + frame)
+            if frame % 20 == 19:
+                writer.flush()
+            if frame == 200:
+                written = writer.bytes_written
+                (path / f"night_{writer.removed_files}.mcap").unlink()
+                assert writer.bytes_written == written
+    assert writer.removed_files > 2
+    assert frames_of(path)[-1] == 599
+
+
 def test_a_split_bag_that_was_cut_is_mended_whole(tmp_path, small_chunks):
     path = tmp_path / "night"
     write_split(path, 300, split_bytes=20_000)
