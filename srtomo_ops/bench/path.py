@@ -31,7 +31,7 @@ WARM_UP = 20
 """First frames of each turn that are checked and not counted (or a fifth of the turn, if that is less)."""
 
 _TIMEOUT = 30.0  # s, for processes to find each other
-_GRACE = 2.0  # s, for the last commands to come
+_GRACE = 10.0  # s, for the last commands to come: what the middleware drops it sends again up to 3 s later
 _NODE = "srtomo_ops.bench.path_node"
 
 Times = NDArray[np.int64]
