@@ -21,8 +21,9 @@ help:
 demo: install
 	$(BIN)/srtomo demo $(ARGS)
 
+# Two files at a time: nodes and processes that are waited for leave a core idle.
 test: install
-	$(BIN)/python -m pytest $(ARGS)
+	$(BIN)/python -m pytest -n 2 --dist loadfile $(ARGS)
 
 test-slow: install
 	$(BIN)/python -m pytest -m slow $(ARGS)
