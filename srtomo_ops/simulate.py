@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from srtomo_core.layout import Layout
 from srtomo_core.reconstructor import Reconstructor
 from srtomo_rtc.loop import Loop, Program, Settings, Slot, Verdict
+from srtomo_rtc.lowrank import Factors
 from srtomo_sim.plant import Plant
 
 SETTLING = 50
@@ -35,10 +36,16 @@ class Run(NamedTuple):
         return float(np.sqrt(np.mean(self.high_order[self.frames >= settling, 0] ** 2)))
 
 
-def program_of(layout: Layout, reconstructor: Reconstructor, settings: Settings | None = None) -> Program:
-    """A program that runs a reconstructor under plain settings."""
-    slot = Slot(layout, reconstructor.n_epochs)
-    slot.fill(reconstructor)
+def program_of(
+    layout: Layout,
+    reconstructor: Reconstructor,
+    settings: Settings | None = None,
+    kernel: str = "float32",
+    factors: Sequence[Factors] = (),
+) -> Program:
+    """A program that runs a reconstructor under plain settings; for kernel tlr its parts' ``factors`` are needed."""
+    slot = Slot(layout, reconstructor.n_epochs, kernel)
+    slot.fill(reconstructor, factors)
     return Program(slot, settings or plain_settings(layout))
 
 

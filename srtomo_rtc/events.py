@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from srtomo_rtc.hrtc import Change, Snapshot
 from srtomo_rtc.loop import LoopState, Program, Settings
-from srtomo_rtc.vmm import KERNELS
 
 
 class EventKind(enum.IntEnum):
@@ -63,7 +62,7 @@ def event_fields(
     }
     if program is not None:
         slot = program.slot
-        fields |= {"reconstructor": slot.id, "sha256": list(slot.sha256), "kernel": KERNELS[slot.kernel]}
+        fields |= {"reconstructor": slot.id, "sha256": list(slot.sha256), "kernel": slot.kernel_name}
         settings = program.settings
     if settings is not None:
         fields |= {"settings": settings.id} | {name: getattr(settings, name) for name in SCALARS}

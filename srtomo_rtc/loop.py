@@ -44,8 +44,9 @@ from srtomo_core.layout import Layout
 from srtomo_core.reconstructor import Reconstructor
 from srtomo_rtc import native
 from srtomo_rtc.crew import Crew
+from srtomo_rtc.lowrank import Factors
 from srtomo_rtc.native import lib
-from srtomo_rtc.vmm import huge_zeros, multiply, quantise, rows_of, tiled, tiles_shape, untiled
+from srtomo_rtc.vmm import KERNELS, huge_zeros, multiply, quantise, rows_of, tiled, tiles_shape, untiled
 
 Floats = NDArray[np.float32]
 
@@ -118,8 +119,10 @@ class Matrices:
     """R and Q for one exposure, in tiles (:func:`srtomo_rtc.vmm.tiled`).
 
     Attributes:
-        R_tiles: of each sensor, its columns sub-aperture by sub-aperture: x, then y; 16-bit integers for kernel int16.
-        R_scales: of each sensor, (n_rows of the tiles,) what its integers are in m/rad; None for kernel float32.
+        R_tiles: of each sensor, its columns sub-aperture by sub-aperture: x, then y; 16-bit integers for kernel int16;
+            none for kernel tlr.
+        R_scales: of each sensor, (n_rows of the tiles,) what its integers are in m/rad; None but for kernel int16.
+        factors: R for kernel tlr.
         Q_tiles: its columns command by command.
     """
 
@@ -127,16 +130,20 @@ class Matrices:
         n_rows = rows_of(layout.n_commands)
         kind: type = np.int16 if kernel == "int16" else np.float32
         self._n_commands = layout.n_commands
-        self.R_tiles = tuple(huge_zeros(tiles_shape(layout.n_commands, s.n_slopes, kind), kind) for s in layout.sensors)
+        tiled_sensors = layout.sensors if kernel != "tlr" else ()
+        self.R_tiles = tuple(huge_zeros(tiles_shape(layout.n_commands, s.n_slopes, kind), kind) for s in tiled_sensors)
+        self.factors: Factors | None = None
+        self._n_slopes = layout.n_slopes
         self.R_scales = tuple(np.ones(n_rows, np.float32) for _ in layout.sensors) if kernel == "int16" else None
         self.Q_tiles = huge_zeros(tiles_shape(layout.n_commands, layout.n_commands, np.float32), np.float32)
 
-    def fill(self, R: Floats, Q: Floats) -> None:
-        """Copy R (n_commands, n_slopes) and Q in.
+    def fill(self, R: Floats, Q: Floats, factors: Factors | None = None) -> None:
+        """Copy R (n_commands, n_slopes) and Q in; for kernel tlr keep R's factors instead of R.
 
         Raises:
             ValueError: R cannot be held in 16 bits.
         """
+        self.factors = factors
         start = 0
         for w, tiles in enumerate(self.R_tiles):
             n = tiles.shape[1]
@@ -150,6 +157,8 @@ class Matrices:
     @property
     def R(self) -> Floats:
         """(n_commands, n_slopes) as it is applied, a copy."""
+        if self.factors is not None:
+            return self.factors.applied()
         m, own = self._n_commands, []
         for w, tiles in enumerate(self.R_tiles):
             matrix = untiled(tiles, m) * (1 if self.R_scales is None else self.R_scales[w][:m, None])
@@ -163,6 +172,8 @@ class Matrices:
 
     def times(self, slopes: Floats) -> Floats:
         """``R slopes``, sensor by sensor; a new array with the tiles' rows."""
+        if self.factors is not None:
+            return self.factors.times(slopes)
         out = np.zeros(rows_of(self._n_commands), np.float32)
         part = np.empty_like(out)
         start = 0
@@ -175,12 +186,16 @@ class Matrices:
 
     def warm(self) -> None:
         """Touch every byte."""
-        self.times(np.zeros(sum(tiles.shape[1] for tiles in self.R_tiles), np.float32))
+        self.times(np.zeros(self._n_slopes, np.float32))
         multiply(self.Q_tiles, np.zeros(self._n_commands, np.float32), np.empty(rows_of(self._n_commands), np.float32))
 
     def native(self) -> native.Matrices:
         """For the frame path; valid as long as this object."""
         made = native.Matrices(Q=self.Q_tiles.ctypes.data)
+        if self.factors is not None:
+            made.low_rank, made.rows = self.factors.native, self.factors.rows.ctypes.data
+            for w, one in enumerate(self.factors.sensors):
+                made.R_scales[w] = one.scales.ctypes.data
         for w, tiles in enumerate(self.R_tiles):
             made.R[w] = tiles.ctypes.data
             if self.R_scales is not None:
@@ -192,7 +207,8 @@ class Slot:
     """Memory for one reconstructor. Made once, filled off the loop.
 
     Attributes:
-        kernel: float32 or int16.
+        kernel: float32, int16 or tlr.
+        kernel_name: as in events; for tlr once it is filled.
         n_epochs: of the reconstructor in it.
         epochs: matrices of each epoch that there is room for, the newest exposure first.
         fallback: for the newest exposure alone; the first epoch's where there is room for no more.
@@ -201,6 +217,7 @@ class Slot:
     def __init__(self, layout: Layout, max_epochs: int = 1, kernel: str = "float32") -> None:
         m = layout.n_commands
         self.kernel = kernel
+        self.kernel_name = KERNELS[kernel]
         self.n_epochs = 1
         self.epochs = tuple(Matrices(layout, kernel) for _ in range(max_epochs))
         self.fallback = Matrices(layout, kernel) if max_epochs > 1 else self.epochs[0]
@@ -210,8 +227,11 @@ class Slot:
         self.id = 0
         self.sha256 = bytes(32)
 
-    def fill(self, reconstructor: Reconstructor) -> None:
+    def fill(self, reconstructor: Reconstructor, factors: Sequence[Factors] = ()) -> None:
         """Copy a checked reconstructor in. Not on the loop's thread, and never into a slot in use.
+
+        Args:
+            factors: of each of its parts, for kernel tlr.
 
         Raises:
             ValueError: it has more epochs than there is room for, or cannot be held in 16 bits.
@@ -219,8 +239,11 @@ class Slot:
         if reconstructor.n_epochs > len(self.epochs):
             raise ValueError(f"uses {reconstructor.n_epochs} exposures; there is room for {len(self.epochs)}")
         self.n_epochs = reconstructor.n_epochs
-        for matrices, (R, Q) in zip((*self.epochs[: self.n_epochs], self.fallback), reconstructor.parts, strict=False):
-            matrices.fill(R, Q)
+        targets = (*self.epochs[: self.n_epochs], self.fallback)
+        each: Sequence[Factors | None] = factors or [None] * len(reconstructor.parts)
+        for matrices, (R, Q), own in zip(targets, reconstructor.parts, each, strict=False):
+            matrices.fill(R, Q, own)
+        self.kernel_name = "-".join([KERNELS[self.kernel], *(own.digest().hex()[:16] for own in factors)])
         self.slope_reference[:] = reconstructor.slope_reference
         self.command_limit[:] = reconstructor.command_limit
         self.gain = reconstructor.gain

@@ -53,10 +53,49 @@ class Product(Structure):
     ]
 
 
+class Block(Structure):
+    """``srt_block``."""
+
+    _fields_ = [("U", c_void_p), ("first", c_uint32), ("last", c_uint32), ("whole", c_uint32)]
+
+
+class Zone(Structure):
+    """``srt_zone``."""
+
+    _fields_ = [
+        ("columns", c_void_p),
+        ("n_columns", c_uint32),
+        ("needs", c_uint32),
+        ("n_inner", c_uint32),
+        ("scratch", c_uint32),
+        ("V", c_void_p),
+        ("V_scales", c_void_p),
+        ("blocks", POINTER(Block)),
+        ("U_bytes", c_size_t),
+    ]
+
+
+class LowRank(Structure):
+    """``srt_low_rank``."""
+
+    _fields_ = [
+        ("zones", POINTER(Zone)),
+        ("n_zones", c_uint32),
+        ("n_tiles", c_uint32),
+        ("scratch", c_void_p),
+    ]
+
+
 class Matrices(Structure):
     """``srt_matrices``."""
 
-    _fields_ = [("R", c_void_p * MAX_SENSORS), ("R_scales", c_void_p * MAX_SENSORS), ("Q", c_void_p)]
+    _fields_ = [
+        ("R", c_void_p * MAX_SENSORS),
+        ("R_scales", c_void_p * MAX_SENSORS),
+        ("low_rank", POINTER(LowRank)),
+        ("rows", c_void_p),
+        ("Q", c_void_p),
+    ]
 
 
 class Program(Structure):
@@ -252,6 +291,7 @@ _FUNCTIONS: dict[str, tuple[Any, tuple[Any, ...]]] = {
     "srt_crew_free": (None, (c_void_p,)),
     "srt_crew_thread": (c_int32, (c_void_p, c_uint32)),
     "srt_crew_multiply": (None, (c_void_p, POINTER(Product))),
+    "srt_low_rank_multiply": (None, (c_void_p, POINTER(LowRank), c_uint32, c_uint32, c_void_p, c_void_p)),
     "srt_loop_use": (None, (_LOOP, c_void_p)),
     "srt_interleave": (None, (c_void_p, c_size_t, c_void_p)),
     "srt_loop_new": (_LOOP, (_WORDS, c_uint32, c_uint32, c_float, c_uint32)),
@@ -336,4 +376,7 @@ def view(owner: object, address: int, shape: tuple[int, ...], kind: str = "<f4")
     return np.asarray(_Memory(owner, address, shape, kind))
 
 
-_must_agree(lib.srt_abi(), sum(map(ctypes.sizeof, (Product, Matrices, Program, Loop, Change, Snapshot, Gate))))
+_must_agree(
+    lib.srt_abi(),
+    sum(map(ctypes.sizeof, (Product, Block, Zone, LowRank, Matrices, Program, Loop, Change, Snapshot, Gate))),
+)

@@ -22,14 +22,22 @@ from srtomo_core.reconstructor import Reconstructor, ReconstructorError, block_t
 from srtomo_core.system import System
 from srtomo_rtc.events import PROGRAM_KINDS, SCALARS, EventKind
 from srtomo_rtc.loop import MAX_EPOCHS, Loop, LoopState, Program, Settings, Slot, Verdict
+from srtomo_rtc.lowrank import factorise
 from srtomo_rtc.vmm import KERNELS
 
-_NAMED = {name: kernel for kernel, name in KERNELS.items()}
 _TIMED = (Verdict.HOLD_INCOMPLETE, Verdict.HOLD_MISSING, Verdict.HOLD_BEHIND)
 _WINDOW = 400  # frames that the bag's order of messages may be off by
 _SHOWN = 5  # differing frames that are kept for the report
 
 _Key = tuple[int, int]  # session, frame
+
+
+def _kernel(name: str) -> str | None:
+    """The kernel of a name in an event; None: it is not known here."""
+    for kernel, known in KERNELS.items():
+        if name == known or (kernel == "tlr" and name.startswith(f"{known}-")):
+            return kernel
+    return None
 
 
 @dataclass
@@ -109,9 +117,9 @@ class Replay:
                 seen.add(message.data)
                 self.events.append(self._reader.decode(message))
         for event in self.events:
-            if event.kernel and event.kernel not in _NAMED:
+            if event.kernel and _kernel(event.kernel) is None:
                 raise BagError(
-                    f"{self._reader.path}: made with kernel {event.kernel}, here are {' and '.join(_NAMED)}: "
+                    f"{self._reader.path}: made with kernel {event.kernel}, here are {', '.join(KERNELS.values())}: "
                     "bits would differ"
                 )
         for message in self._of(wire.STATE):
@@ -162,15 +170,26 @@ class Replay:
                 self._reconstructors[sha256] = reconstructor
 
     def program(self, event: Any) -> Program | None:
-        """What the loop runs from an event on; None if its reconstructor is not known."""
+        """What the loop runs from an event on; None if its reconstructor is not known.
+
+        Raises:
+            BagError: its low-rank factors do not come out here as they did there.
+        """
         reconstructor = self._reconstructors.get(bytes(event.sha256))
         if reconstructor is None:
             return None
-        key = reconstructor.sha256, _NAMED.get(event.kernel, "float32")
+        key = reconstructor.sha256, _kernel(event.kernel) or "float32"
         slot = self._slots.get(key)
         if slot is None:
             slot = self._slots[key] = Slot(self.layout, reconstructor.n_epochs, key[1])
-            slot.fill(reconstructor)
+            low_rank = reconstructor.parts if key[1] == "tlr" else []
+            slot.fill(reconstructor, [factorise(self.system, self.layout, R) for R, _ in low_rank])
+        if slot.kernel == "tlr" and slot.kernel_name != event.kernel:
+            raise BagError(
+                f"{self._reader.path}: made with kernel {event.kernel}; the factors of reconstructor "
+                f"{reconstructor.id:016x} come out as {slot.kernel_name} here, with another LAPACK or processor: "
+                "bits would differ"
+            )
         return Program(
             slot,
             Settings(

@@ -24,8 +24,9 @@ from srtomo_core.layout import Layout
 from srtomo_core.reconstructor import Reconstructor, ReconstructorError, block_table, n_parts
 from srtomo_core.system import System
 from srtomo_core.wire import ReconstructorBlock
-from srtomo_rtc.compression import INT16_LIMIT, int16_to_noise
-from srtomo_rtc.loop import Program, Settings, Slot
+from srtomo_rtc.compression import LIMIT, error_to_noise, int16_to_noise
+from srtomo_rtc.loop import Matrices, Program, Settings, Slot
+from srtomo_rtc.lowrank import Factors, factorise
 
 Floats = NDArray[np.float32]
 
@@ -80,11 +81,13 @@ class Check:
         scale: range of ``w.(G_cal R w) / w.w`` for the slopes w of smooth shapes, R summed over the epochs, and of the
             fallback's; NaN where no mirror is seen.
         unseen: names of mirrors that no sensor sees, whose sign and scale nothing here can tell.
+        compression: what a kernel that does not hold R in float32 makes of it; empty: nothing.
     """
 
     stability: float
     scale: tuple[float, float]
     unseen: tuple[str, ...] = ()
+    compression: str = ""
 
     def __str__(self) -> str:
         text = f"stability {self.stability:.3f}"
@@ -92,7 +95,7 @@ class Check:
             text += f", scale {self.scale[0]:.2f} to {self.scale[1]:.2f}"
         if self.unseen:
             text += f"; {', '.join(self.unseen)}: seen by no sensor, sign and scale not checked"
-        return text
+        return f"{text}; {self.compression}" if self.compression else text
 
 
 @dataclass(frozen=True)
@@ -256,7 +259,8 @@ class Swap:
             else run no frame before: slots are used again.
         max_epochs: exposures that a reconstructor may use: the loop's. Three slots and a transfer have room for so many
             and, with more than one, a fallback: ``4 (max_epochs + 1) n_commands (n_slopes + n_commands)`` floats.
-        kernel: float32, or int16, which holds R in half the memory and refuses what that would spoil.
+        kernel: float32; int16, which holds R in half the memory; tlr, which holds it in tiles of low rank. Both refuse
+            what that would spoil, and tlr also what is no smaller than with int16.
 
     Raises:
         ValueError: G_cal is not of the instrument's shape.
@@ -386,10 +390,14 @@ class Swap:
         """As :meth:`stage`, for a reconstructor that is whole already (from a file)."""
         self._check_epochs(reconstructor.n_epochs)
         result = check(reconstructor, self._layout, self._G_cal, self._sees_tip_tilt, self._sees_focus)
+        factors: list[Factors] = []
         if self._kernel == "int16":
-            self._check_int16(reconstructor)
+            result = replace(result, compression=self._check_int16(reconstructor))
+        elif self._kernel == "tlr":
+            factors, compression = self._factorise(reconstructor)
+            result = replace(result, compression=compression)
         slot = self._free()
-        slot.fill(reconstructor)
+        slot.fill(reconstructor, factors)
         Program(slot, self.settings).warm()
         self.staged = Held(slot, result, reconstructor)
         return self.staged
@@ -399,24 +407,64 @@ class Swap:
         return next(slot for slot in self._slots if id(slot) not in in_use)
 
     def scratch(self) -> tuple[NDArray[Any], ...]:
-        """R's tiles of a slot that the loop does not use, to measure with; what was staged in it is lost."""
+        """R's tiles of a slot that the loop does not use, to measure with; what was staged in it is lost.
+
+        For low rank, which has none before there are factors, new ones of 16 bits: an upper bound.
+        """
         self.staged = None
+        if self._kernel == "tlr":
+            return Matrices(self._layout, "int16").R_tiles
         return self._free().epochs[0].R_tiles
 
     def _check_epochs(self, n_epochs: int) -> None:
         if not 1 <= n_epochs <= self._max_epochs:
             raise Refused(f"uses {n_epochs} exposures; this loop takes {self._max_epochs} (parameter max_epochs)")
 
-    def _check_int16(self, reconstructor: Reconstructor) -> None:
+    def _check_int16(self, reconstructor: Reconstructor) -> str:
         try:
             ratio = max(int16_to_noise(self._system, self._layout, R) for R, _ in reconstructor.parts)
         except ValueError as error:
             raise Refused(f"16 bits: {error}") from None
-        if not ratio <= INT16_LIMIT:
+        if not ratio <= LIMIT:
             raise Refused(
-                f"16 bits would err by {ratio:.2g} of what photon noise leaves in the commands, limit {INT16_LIMIT:g}: "
+                f"16 bits would err by {ratio:.2g} of what photon noise leaves in the commands, limit {LIMIT:g}: "
                 "it takes kernel float32"
             )
+        return f"16 bits err by {ratio:.1g} of photon noise"
+
+    def _factorise(self, reconstructor: Reconstructor) -> tuple[list[Factors], str]:
+        """Each part's R in factors, and what that makes of it.
+
+        Raises:
+            Refused: they err too much, make the loop unstable, or are no smaller than 16-bit integers.
+        """
+        found, shares, ratios = [], [], []
+        for R, _ in reconstructor.parts:
+            try:
+                factors = factorise(self._system, self._layout, R)
+            except ValueError as error:
+                raise Refused(f"low rank: {error}") from None
+            shares.append(share := factors.nbytes / R.nbytes)
+            if share >= 0.5:
+                raise Refused(
+                    f"low rank would take {share:.2f} of float32's memory, where 16 bits take 0.5: "
+                    "it takes kernel int16 or float32"
+                )
+            ratios.append(ratio := error_to_noise(self._system, self._layout, R, factors.applied()))
+            if not ratio <= LIMIT:
+                raise Refused(
+                    f"low rank would err by {ratio:.2g} of what photon noise leaves in the commands, limit {LIMIT:g}: "
+                    "it takes kernel float32"
+                )
+            found.append(factors)
+        applied = [Q - own.applied() @ self._G_cal for own, (_, Q) in zip(found, reconstructor.parts, strict=True)]
+        mismatch = np.stack(applied).astype(np.float64)
+        n = reconstructor.n_epochs
+        radius = max(stability(mismatch[:n]), stability(mismatch[n:]) if len(mismatch) > n else 0.0)
+        if not radius < STABILITY_LIMIT:
+            raise Refused(f"low rank: spectral radius of Q - R G_cal is {radius:.3f}, limit {STABILITY_LIMIT:g}")
+        what = f"low rank takes {max(shares):.2f} of float32's memory and errs by {max(ratios):.1g} of photon noise"
+        return found, what
 
     def forget(self) -> None:
         """Give the transfer under way up."""

@@ -24,8 +24,13 @@ Int16s = NDArray[np.int16]
 _TILE_BYTES = 128
 _ROWS = 64  # of the larger tile
 
-KERNELS = {"float32": "subapertures-float32-1thread", "int16": "subapertures-int16-rowscale-1thread"}
-"""Name, arithmetic and threads, by parameter ``kernel``; in HrtcEvent and in every bag. The bits belong to the name."""
+KERNELS = {
+    "float32": "subapertures-float32-1thread",
+    "int16": "subapertures-int16-rowscale-1thread",
+    "tlr": "zones-int16-lowrank",
+}
+"""Name and arithmetic, by parameter ``kernel``; in HrtcEvent and in every bag. The bits belong to the name, which for
+low rank goes on with a digest of the factors."""
 
 _INT16_MAX = 32767
 _HUGE = 2 << 20  # bytes of a huge page

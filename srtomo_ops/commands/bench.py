@@ -9,11 +9,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from srtomo_core.reconstructor import Reconstructor
-from srtomo_ops.bench import latency, soak
+from srtomo_ops.bench import kernels, latency, soak
 from srtomo_ops.bench.latency_report import numbers, report
 from srtomo_ops.bench.reconstruct import measure
 from srtomo_ops.options import add_json, add_system, changes_of, system_of, write_json
 from srtomo_ops.progress import Progress
+from srtomo_rtc.crew import candidates
+from srtomo_rtc.vmm import instructions
 
 if TYPE_CHECKING:
     from srtomo_ops.bench.path import Paths
@@ -22,10 +24,11 @@ EXAMPLE = """examples:
   srtomo bench reconstruct gnao_ltao_sr
   srtomo bench reconstruct mavis --threads 2 --json mavis.json
   srtomo bench latency gnao_ltao_sr --json latency.json
-  srtomo bench soak gnao_ltao_sr --frames 20000"""
+  srtomo bench soak gnao_ltao_sr --frames 20000
+  srtomo reconstruct gnao_ltao_sr -o sr.npz && srtomo bench kernels gnao_ltao_sr --reconstructor sr.npz"""
 
 _GIB = 2**30
-_FRAMES = {"latency": 250, "soak": 1_000_000}
+_FRAMES = {"latency": 250, "kernels": 250, "soak": 1_000_000}
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -33,27 +36,38 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "what",
         metavar="WHAT",
-        choices=("reconstruct", "latency", "soak"),
-        help="reconstruct: build a reconstructor; latency: slopes to command; soak: a million frames with swaps and "
-        "faults, each checked",
+        choices=("reconstruct", "latency", "kernels", "soak"),
+        help="reconstruct: build a reconstructor; latency: slopes to command; kernels: float32, int16 and low rank "
+        "beside each other; soak: a million frames with swaps and faults, each checked",
     )
     add_system(parser, default="gnao_ltao_sr")
     cores = len(os.sched_getaffinity(0))
     build = parser.add_argument_group("reconstruct")
-    build.add_argument("--threads", type=int, default=cores, help=f"to compute with (default: {cores}, all cores)")
+    build.add_argument(
+        "--threads",
+        type=int,
+        default=cores,
+        help=f"to compute with (default: {cores}, all cores); kernels: the most to try",
+    )
     build.add_argument(
         "--exact", action="store_true", help="float64, nothing interpolated (default: as fast as it goes)"
     )
     loop = parser.add_argument_group("latency")
     loop.add_argument(
-        "--frames", type=int, help=f"of one turn (default: {_FRAMES['latency']}); of a soak: all ({_FRAMES['soak']})"
+        "--frames",
+        type=int,
+        help=f"of one turn (default: {_FRAMES['latency']}); of each kernel ({_FRAMES['kernels']}); "
+        f"of a soak: all ({_FRAMES['soak']})",
     )
     loop.add_argument("--pairs", type=int, default=10, help="of turns, HRTC and echo, of each arrival (default: 10)")
     loop.add_argument("--packets", type=int, default=4, help="a sensor and frame when staggered (default: 4)")
     loop.add_argument("--fifo-priority", type=int, default=0, help="SCHED_FIFO of both nodes (default: 0, none)")
     loop.add_argument("--compute-only", action="store_true", help="without processes, without ROS")
     loop.add_argument(
-        "--reconstructor", metavar="FILE", type=Path, help="to run (default: least squares, of the same size)"
+        "--reconstructor",
+        metavar="FILE",
+        type=Path,
+        help="to run (default: least squares, of the same size); kernels: has to be given, ranks depend on it",
     )
     long = parser.add_argument_group("soak")
     long.add_argument("--swap-every", metavar="N", type=int, default=1000, help="frames (default: 1000)")
@@ -66,7 +80,8 @@ def main(options: argparse.Namespace) -> int:
     """Run the command; exit code 1 if a target is missed."""
     if options.frames is None:
         options.frames = _FRAMES.get(options.what)
-    return {"latency": _latency, "soak": _soak, "reconstruct": _reconstruct}[options.what](options)
+    run = {"latency": _latency, "kernels": _kernels, "soak": _soak, "reconstruct": _reconstruct}
+    return run[options.what](options)
 
 
 def _reconstruct(options: argparse.Namespace) -> int:
@@ -102,6 +117,34 @@ def _reconstruct(options: argparse.Namespace) -> int:
             "gemm_gflops": build.gemm_flops / 1e9,
             "fraction_of_gemm": fraction,
             "residual": build.residual,
+        },
+    )
+    return 0
+
+
+def _kernels(options: argparse.Namespace) -> int:
+    if options.reconstructor is None:
+        raise ValueError("--reconstructor: expected a file of 'srtomo reconstruct': ranks depend on it")
+    for name in ("frames", "threads"):
+        if getattr(options, name) < 1:
+            raise ValueError(f"--{name}: expected at least 1, got {getattr(options, name)}")
+    system = system_of(options)
+    with Progress("kernels") as progress:
+        rows = kernels.measure(
+            system,
+            Reconstructor.load(options.reconstructor),
+            candidates(options.threads),
+            options.frames,
+            progress=progress.stage,
+        )
+    print("\n".join([f"{system.name}, {options.frames} frames each, {instructions()}", *kernels.table(rows)]))
+    write_json(
+        options.json,
+        {
+            "system": system.name,
+            "frames": options.frames,
+            "instructions": instructions(),
+            "kernels": [{**vars(row), "median": row.median} for row in rows],
         },
     )
     return 0

@@ -14,6 +14,8 @@ from srtomo_core.reconstructor import Reconstructor
 from srtomo_ops.options import add_json, add_schedule, add_system, schedule_of, system_of, write_json
 from srtomo_ops.progress import Progress
 from srtomo_ops.simulate import SETTLING, Run, plain_settings, program_of, run
+from srtomo_rtc.lowrank import factorise
+from srtomo_rtc.vmm import KERNELS
 from srtomo_sim.course import scheduled
 from srtomo_sim.plant import Plant
 from srtomo_sim.sky import prepare, strehl
@@ -34,6 +36,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
     source = parser.add_mutually_exclusive_group()
     source.add_argument("--reconstructor", metavar="FILE", type=Path, help="use this one instead of building one")
     source.add_argument("--prior", choices=("file", "ground"), default="file", help="to build one with (default: file)")
+    parser.add_argument(
+        "--kernel", choices=tuple(KERNELS), default="float32", help="that the loop multiplies with (default: float32)"
+    )
     add_schedule(parser)
     add_json(parser)
 
@@ -55,7 +60,10 @@ def main(options: argparse.Namespace) -> int:
         raise ValueError(f"{options.reconstructor}: made for another instrument than {system.name}")
     with Progress("sky") as progress:
         sky = prepare(system, options.frames, options.seed, changes=changes, progress=progress.share)
-    program = program_of(sky.layout, reconstructor, plain_settings(sky.layout, system.loop.leak))
+    parts = reconstructor.parts if options.kernel == "tlr" else []
+    factors = [factorise(system, sky.layout, R) for R, _ in parts]
+    settings = plain_settings(sky.layout, system.loop.leak)
+    program = program_of(sky.layout, reconstructor, settings, options.kernel, factors)
     with Progress("loop") as progress:
         result = run(
             Plant(system, sky), {0: program}, closed=not options.open, each=lambda k: progress.share(k / options.frames)
@@ -64,6 +72,7 @@ def main(options: argparse.Namespace) -> int:
     numbers = {
         "system": system.name,
         "reconstructor": f"{reconstructor.id:016x}",
+        "kernel": program.slot.kernel_name,
         "rate_hz": system.loop.rate,
         "frames": options.frames,
         "seed": options.seed,

@@ -32,7 +32,10 @@ struct srt_crew {
     uint32_t n_members;
     int64_t spin_ns;
     size_t least_bytes;
-    srt_product product; /* written while no piece is left, read by who has begun one */
+    /* written while no piece is left, read by who has begun one */
+    srt_part part;
+    const void *work;
+    size_t n;
     _Alignas(LINE) _Atomic uint32_t number; /* of the product, and the futex that helpers sleep on */
     atomic_int asleep;
     atomic_bool over;
@@ -55,14 +58,15 @@ static int64_t now(void)
     return time.tv_sec * 1000000000ll + time.tv_nsec;
 }
 
-/* Form pieces of one member's share until none is left. */
-static void work(srt_crew *crew, uint32_t of)
+/* Do pieces of one member's share until none is left. */
+static void do_share(srt_crew *crew, uint32_t of)
 {
     int piece;
     while ((piece = atomic_fetch_sub_explicit(&crew->members[of].left, 1, memory_order_acquire)) > 0) {
         size_t pieces = (size_t)crew->n_members * PIECES, which = (size_t)of * PIECES + (size_t)(piece - 1);
-        size_t n = crew->product.n_tiles;
-        srt_multiply(&crew->product, n * which / pieces, n * (which + 1) / pieces);
+        size_t from = crew->n * which / pieces, to = crew->n * (which + 1) / pieces;
+        if (to > from)
+            crew->part(crew->work, from, to);
         atomic_fetch_sub_explicit(&crew->unfinished, 1, memory_order_release);
     }
 }
@@ -90,7 +94,7 @@ static void *help(void *argument)
     for (uint32_t seen = 0; !atomic_load(&crew->over);) {
         await(crew, seen);
         seen = atomic_load(&crew->number);
-        work(crew, (uint32_t)(self - crew->members));
+        do_share(crew, (uint32_t)(self - crew->members));
     }
     return NULL;
 }
@@ -160,20 +164,32 @@ int32_t srt_crew_thread(const srt_crew *crew, uint32_t helper)
     return helper + 1 < crew->n_members ? atomic_load(&crew->members[helper + 1].thread) : 0;
 }
 
-void srt_crew_multiply(srt_crew *crew, const srt_product *product)
+void srt_crew_share(srt_crew *crew, srt_part part, const void *work, size_t n, size_t bytes)
 {
-    size_t bytes = product->n_tiles * (product->last - product->first) * SRT_COLUMN;
     if (!crew || crew->n_members == 1 || bytes < crew->least_bytes) {
-        srt_multiply(product, 0, product->n_tiles);
+        part(work, 0, n);
         return;
     }
-    crew->product = *product;
+    crew->part = part;
+    crew->work = work;
+    crew->n = n;
     atomic_store_explicit(&crew->unfinished, crew->n_members * PIECES, memory_order_relaxed);
     for (uint32_t i = 0; i < crew->n_members; i++)
         atomic_store_explicit(&crew->members[i].left, PIECES, memory_order_release);
     announce(crew);
     for (uint32_t i = 0; i < crew->n_members; i++)
-        work(crew, i);
+        do_share(crew, i);
     while (atomic_load_explicit(&crew->unfinished, memory_order_acquire))
         rest();
+}
+
+static void multiply(const void *product, size_t from, size_t to)
+{
+    srt_multiply(product, from, to);
+}
+
+void srt_crew_multiply(srt_crew *crew, const srt_product *product)
+{
+    size_t bytes = product->n_tiles * (product->last - product->first) * SRT_COLUMN;
+    srt_crew_share(crew, multiply, product, product->n_tiles, bytes);
 }

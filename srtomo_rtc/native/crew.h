@@ -21,6 +21,12 @@ void srt_crew_free(srt_crew *crew);
 /* A helper's thread, for the scheduler's calls. */
 int32_t srt_crew_thread(const srt_crew *crew, uint32_t helper);
 
+/* Items from .. to - 1 of some work. */
+typedef void (*srt_part)(const void *work, size_t from, size_t to);
+
+/* part of all n items, shared with the helpers; bytes: of matrix that are read. One thread at a time calls it. */
+void srt_crew_share(srt_crew *crew, srt_part part, const void *work, size_t n, size_t bytes);
+
 /* srt_multiply of every tile, shared with the helpers; NULL: there are none. One thread at a time calls it. */
 void srt_crew_multiply(srt_crew *crew, const srt_product *product);
 

@@ -1,6 +1,7 @@
 /* The frame path: serialised slopes in, serialised commands out. No allocation once made, no lock, no interpreter.
  *
- * law.c holds the control law, crew.c the threads that share its products, gate.c the frame gate around it, ring.c what
+ * law.c holds the control law, crew.c the threads that share its
+ * products, lowrank.c some of these, gate.c the frame gate around it, ring.c what
  * both leave for the recorder; ros.c drives them from rcl. What they do is described where Python wraps them:
  * srtomo_rtc/loop.py, crew.py and hrtc.py. Structures that Python reads are mirrored in srtomo_rtc/native.py, which
  * compares srt_abi() with its own sum.
@@ -17,6 +18,7 @@
 #include <stdint.h>
 
 #include "crew.h"
+#include "lowrank.h"
 
 enum {
     SRT_HISTORY = 64,   /* commands remembered, frames */
@@ -52,6 +54,8 @@ enum srt_loop_state {
 typedef struct {
     const void *R[SRT_MAX_SENSORS];
     const float *R_scales[SRT_MAX_SENSORS]; /* (n_rows) each: R holds 16-bit integers; NULL: float32 */
+    const srt_low_rank *low_rank;           /* (n_sensors) instead of R, with scales; NULL: none */
+    const uint32_t *rows;                   /* (n_rows) of low_rank: which command's each row is */
     const float *Q;
 } srt_matrices;
 

@@ -650,6 +650,6 @@ void srt_gate_flatten(srt_gate *shared)
 
 size_t srt_abi(void)
 {
-    return sizeof(srt_product) + sizeof(srt_matrices) + sizeof(srt_program) + offsetof(srt_loop, posted) +
+    return sizeof(srt_product) + sizeof(srt_block) + sizeof(srt_zone) + sizeof(srt_low_rank) + sizeof(srt_matrices) + sizeof(srt_program) + offsetof(srt_loop, posted) +
            sizeof(srt_change) + sizeof(srt_snapshot) + sizeof(srt_gate);
 }

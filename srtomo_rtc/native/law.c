@@ -175,6 +175,11 @@ static size_t n_tiles(const srt_loop *loop)
 static void accumulate(const srt_loop *loop, const srt_matrices *matrices, uint32_t sensor, size_t first, size_t last,
                        const float *slopes, float *sums)
 {
+    if (matrices->low_rank) {
+        srt_low_rank_multiply(loop->crew, matrices->low_rank + sensor, (uint32_t)first / 2, (uint32_t)last / 2, slopes,
+                              sums);
+        return;
+    }
     bool int16 = matrices->R_scales[sensor] != NULL;
     srt_product product = {.tiles = matrices->R[sensor], .n_tiles = int16 ? loop->n_rows / SRT_TILE_INT16 : n_tiles(loop),
                            .n_columns = 2 * (size_t)loop->n_subapertures[sensor], .first = first, .last = last,
@@ -187,7 +192,11 @@ static void add_scaled(const srt_loop *loop, const srt_matrices *matrices, uint3
                        float *restrict total)
 {
     const float *scales = matrices->R_scales[sensor];
-    if (scales)
+    const uint32_t *rows = matrices->rows;
+    if (rows)
+        for (size_t i = 0; i < loop->n_rows; i++)
+            total[rows[i]] += scales[i] * sums[i];
+    else if (scales)
         for (size_t i = 0; i < loop->n_rows; i++)
             total[i] += scales[i] * sums[i];
     else

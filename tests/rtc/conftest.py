@@ -247,8 +247,8 @@ class Bench:
 
 @pytest.fixture(scope="session")
 def bench(mini):
-    """Makes a Bench; a recorded one is for ``finish`` to close."""
-    return lambda **options: Bench(mini, **options)
+    """Makes a Bench, of ``mini`` or of another instrument made like it; a recorded one is for ``finish`` to close."""
+    return lambda of=mini, **options: Bench(of, **options)
 
 
 @pytest.fixture(scope="session")

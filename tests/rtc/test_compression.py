@@ -13,7 +13,7 @@ from srtomo_rtc.replay import Replay
 from srtomo_rtc.swap import Refused
 
 
-def test_the_stated_error_is_that_of_uniform_rounding(mini):
+def test_the_stated_error_is_that_of_uniform_rounding(bench, mini):
     """From closed form: steps of the largest element of a row and sensor / 32767, over sqrt(12), in each element."""
     system, layout, R = mini.system, mini.layout, mini.a.R[0].astype(float)
     error = noise = 0.0
@@ -26,6 +26,9 @@ def test_the_stated_error_is_that_of_uniform_rounding(mini):
         noise += np.sum(block**2 @ photon)
     found = int16_to_noise(system, layout, mini.a.R[0])
     assert 0 < found < 0.01
+    assert str(bench(kernel="int16").swap.stage_whole(mini.a).check).endswith(
+        f"16 bits err by {found:.1g} of photon noise"
+    )
     assert found == pytest.approx(np.sqrt(error / noise), rel=0.1)
 
 

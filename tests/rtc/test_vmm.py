@@ -128,7 +128,11 @@ def test_what_is_not_finite_comes_out():
 def test_the_kernels_have_names():
     """Bags say which kernel made them: change the name with the arithmetic, and keep the bits with the name."""
     matrix, vector = problem(9, 5)
-    assert KERNELS == {"float32": "subapertures-float32-1thread", "int16": "subapertures-int16-rowscale-1thread"}
+    assert KERNELS == {
+        "float32": "subapertures-float32-1thread",
+        "int16": "subapertures-int16-rowscale-1thread",
+        "tlr": "zones-int16-lowrank",
+    }
     assert np.array_equal(product(matrix, vector), rounded_in_order(matrix, vector))
     assert instructions() in ("AVX-512", "AVX2", "SSE2", "baseline")
 
