@@ -7,11 +7,11 @@ their ``sec z``.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import gamma, kv
+from scipy.special import factorial, gamma, kv
 
 from srtomo_core.system import System
 
@@ -26,6 +26,8 @@ METRES_PER_RADIAN = WAVELENGTH / (2 * math.pi)
 TABLE_STEP = 0.5e-3
 """Grid of :class:`CovarianceTable`, m. Linear interpolation is then good to 1e-6 of D(rho) from rho = 0.2 m on, and to
 1e-4 rad^2 at any rho for r0 = 0.15 m."""
+
+_SMOOTH = 3  # degree of the polynomial in rho^2 that takes the place of the covariance's cusp
 
 
 @dataclass(frozen=True)
@@ -87,10 +89,13 @@ class CovarianceTable:
     The constant C(0) never shows in slopes or in piston-removed phase; without it nothing large cancels.
 
     Attributes:
+        r0, outer_scale: as :func:`covariance` takes them, m.
         step: m.
         values: (n,) at rho = 0, step, 2 step, ...
     """
 
+    r0: float
+    outer_scale: float
     step: float
     values: Array
 
@@ -98,7 +103,25 @@ class CovarianceTable:
     def build(cls, r0: float, outer_scale: float, reach: float, step: float = TABLE_STEP) -> CovarianceTable:
         """Tabulate from 0 to just beyond ``reach`` (m). Other arguments as :func:`covariance`."""
         rho = step * np.arange(math.ceil(reach / step) + 2)
-        return cls(step, -0.5 * METRES_PER_RADIAN**2 * structure_function(rho, r0, outer_scale))
+        values = -0.5 * METRES_PER_RADIAN**2 * structure_function(rho, r0, outer_scale)
+        return cls(r0, outer_scale, step, values)
+
+    def split(self, core: float) -> tuple[CovarianceTable, CovarianceTable]:
+        """In two that add up to this one: one without the cusp at rho = 0, and one that is 0 from ``core`` (m) on.
+
+        Within the core the first is the covariance's Taylor polynomial in rho^2 about the core's edge.
+        """
+        n = min(math.ceil(core / self.step), len(self.values))
+        edge = 2 * np.pi * core / self.outer_scale
+        # of C as a function of z^2: d/d(z^2) z^v K_v(z) = -1/2 z^(v-1) K_(v-1)(z)
+        orders = np.arange(_SMOOTH + 1)
+        bessel = (-0.5) ** orders * edge ** (5 / 6 - orders) * kv(5 / 6 - orders, edge) / factorial(orders)
+        away = (2 * np.pi * self.step * np.arange(n) / self.outer_scale) ** 2 - edge**2
+        variance = covariance(0.0, self.r0, self.outer_scale)
+        scale = float(variance) / (gamma(5 / 6) / 2 ** (1 / 6))
+        polynomial = METRES_PER_RADIAN**2 * (scale * np.polynomial.polynomial.polyval(away, bessel) - variance)
+        smooth = np.concatenate([polynomial, self.values[n:]])
+        return replace(self, values=smooth), replace(self, values=self.values - smooth)
 
     def __call__(self, rho: ArrayLike) -> Array:
         """Interpolate as the compiled loops do; ``rho`` up to the table's reach, m."""

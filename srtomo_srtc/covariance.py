@@ -3,12 +3,13 @@
 Wavefronts are correlated at nodes, and sparse gradient operators turn nodes into slopes, block by block, so that no
 covariance of nodes is ever whole. Node pairs go layer by layer, and stars at different distances, shifts and rotations
 need no case of their own; or they go through tables (:mod:`srtomo_srtc.lattice`), wherever these are exact, and with
-``fast`` also where they interpolate: one table for a pair of sensors, one for each layer from a sensor to points that a
-science target is seen through.
+``fast`` also where they interpolate: one table for a pair of sensors, and tables of each layer from a sensor to points
+that a science target is seen through (:mod:`srtomo_srtc.layered`).
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -22,6 +23,7 @@ from scipy import sparse
 from srtomo_srtc.atmosphere import CovarianceTable, Profile
 from srtomo_srtc.geometry import Footprints, SeenLattice
 from srtomo_srtc.lattice import Correlator, PairTable, is_on_lattice
+from srtomo_srtc.layered import WIDEST, LayeredCorrelator, Neighbours
 from srtomo_srtc.parallel import Progress, run, silent
 from srtomo_srtc.solve import SymmetricTiles
 
@@ -171,22 +173,18 @@ def slope_products(
     starts = np.cumsum([0] + [sensor.gradient.shape[0] for sensor in sensors])
     dtype = np.float32 if fast else np.float64
     out = np.zeros((shares[0].weights.shape[1], starts[-1]), dtype)
-    orders, tiles = zip(*(_tiles(share, dtype) for share in shares), strict=True)
-    points = Footprints(
-        *(
-            np.hstack([getattr(share.points, axis)[:, order] for share, order in zip(shares, orders, strict=True)])
-            for axis in "xy"
-        )
-    )
-    begins = np.cumsum([0] + [len(order) for order in orders])
+    widest = WIDEST * min((s.seen.lattice.step for s in sensors if fast and s.seen is not None), default=math.inf)
+    tiles = [tile for share in shares for tile in _tiles(share, dtype, widest)]
+    groups = [Neighbours.of(tile.points) for tile in tiles]
+    most = max(len(tile.sums) for tile in tiles)
 
     def add(sensor: Sightline, slopes: slice) -> None:
-        correlate = _point_correlation(turbulence, sensor, points, fast)
-        mine = out[:, slopes]
-        for begin, own in zip(begins, tiles):
-            for tile in own:
-                products = tile.weights @ correlate(slice(begin + tile.points.start, begin + tile.points.stop))
-                _add_rows(mine, tile.sums, products)
+        correlate = _point_correlation(turbulence, sensor, groups, fast)
+        mine, products = out[:, slopes], np.empty((most, slopes.stop - slopes.start), dtype)
+        for tile, group in zip(tiles, groups, strict=True):
+            own = products[: len(tile.sums)]
+            np.matmul(tile.weights, correlate(group), out=own)
+            _add_rows(mine, tile.sums, own)
 
     slices = [slice(*pair) for pair in pairwise(starts)]
     run([partial(add, *pair) for pair in zip(sensors, slices)], threads, progress)
@@ -198,21 +196,21 @@ class _Tile:
     """Neighbouring points of a :class:`Share`.
 
     Attributes:
-        points: where they are in the share's order of tiles.
+        points: on the profile's layers.
         sums: (n_sums,) those in which they count.
         weights: (n_sums, n_points).
     """
 
-    points: slice
+    points: Footprints
     sums: NDArray[np.integer]
     weights: Matrix
 
 
-def _tiles(share: Share, dtype: type[np.floating]) -> tuple[NDArray[np.intp], list[_Tile]]:
-    """An order of a share's points in which they come tile by tile, and these tiles."""
+def _tiles(share: Share, dtype: type[np.floating], widest: float) -> list[_Tile]:
+    """A share's points in tiles that are no wider than so many metres."""
     # near each other on the lowest layer
     x, y = share.points.x[0], share.points.y[0]
-    side = _TILE * np.sqrt(np.ptp(x) * np.ptp(y) / len(x))
+    side = min(_TILE * np.sqrt(np.ptp(x) * np.ptp(y) / len(x)), widest)
     column, row = (np.floor((values - values.min()) / side).astype(np.int64) for values in (x, y))
     where = row * (column.max() + 1) + column
     order = np.argsort(where, kind="stable")
@@ -226,8 +224,8 @@ def _tiles(share: Share, dtype: type[np.floating]) -> tuple[NDArray[np.intp], li
         sums, rows = np.unique(own.col[counts], return_inverse=True)
         dense = np.zeros((len(sums), last - first), dtype)
         dense[rows, own.row[counts]] = own.data[counts]
-        tiles.append(_Tile(slice(first, last), sums, dense))
-    return order, tiles
+        tiles.append(_Tile(share.points.part(order[first:last]), sums, dense))
+    return tiles
 
 
 @numba.njit(cache=True, nogil=True)
@@ -249,22 +247,17 @@ def _node_correlation(turbulence: Turbulence, first: Sightline, second: Sightlin
             table = PairTable.build(
                 b.lattice, centres, b.cones, b.offsets - a.offsets, turbulence.fractions, turbulence.table
             )
-            return Correlator([table], second.gradient)
+            return Correlator(table, second.gradient)
     return _layer_by_layer(turbulence, second, first.nodes)
 
 
-def _point_correlation(turbulence: Turbulence, sensor: Sightline, points: Footprints, fast: bool) -> Correlate:
-    """Of any points with the sensor's slopes; with ``fast`` in float32, and from a table for each layer."""
-    seen = sensor.seen
-    if not fast or seen is None:
-        return _layer_by_layer(turbulence, sensor, points)
-    tables = []
-    for l, (cone, offset) in enumerate(zip(seen.cones, seen.offsets, strict=True)):
-        # where the rays from the star through the points meet the pupil
-        centres = seen.lattice.to_steps((points.x[l] - offset[0]) / cone, (points.y[l] - offset[1]) / cone)
-        one = np.array([cone]), np.zeros((1, 2)), turbulence.fractions[l : l + 1]
-        tables.append(PairTable.build(seen.lattice, centres, *one, turbulence.table, np.float32))
-    return Correlator(tables, sensor.gradient)
+def _point_correlation(
+    turbulence: Turbulence, sensor: Sightline, groups: Sequence[Neighbours], fast: bool
+) -> Callable[[Neighbours], Matrix]:
+    """Of any group of points with the sensor's slopes: (n_points, n_slopes) rad m; with ``fast`` in float32."""
+    if fast and sensor.seen is not None:
+        return LayeredCorrelator(sensor.seen, sensor.gradient, groups, turbulence.fractions, turbulence.table)
+    return lambda group: np.asarray((sensor.gradient @ wavefront_covariance(turbulence, sensor.nodes, group.points)).T)
 
 
 def _layer_by_layer(turbulence: Turbulence, sensor: Sightline, points: Footprints) -> Correlate:

@@ -31,6 +31,10 @@ class Footprints:
         """The same on some of the layers."""
         return Footprints(self.x[layers], self.y[layers])
 
+    def part(self, points: slice | NDArray[np.intp]) -> Footprints:
+        """Some of the points."""
+        return Footprints(self.x[:, points], self.y[:, points])
+
 
 def footprints(x: Array, y: Array, direction: Direction, distance: float, heights: Array) -> Footprints:
     """Follow pupil points towards a star: ``xi_l x + h_l alpha`` with ``xi_l = 1 - h_l / distance`` (eq. 26).
@@ -114,6 +118,12 @@ class SeenLattice:
     def only(self, layers: slice) -> SeenLattice:
         """The same on some of the layers."""
         return SeenLattice(self.lattice, self.cones[layers], self.offsets[layers])
+
+    def centres(self, points: Footprints) -> Array:
+        """(n_layers, n_points, 2) row and column, not whole, where rays from the star through points on the layers meet
+        the lattice."""
+        cones, (x, y) = self.cones[:, None], self.offsets.T[:, :, None]
+        return self.lattice.to_steps((points.x - x) / cones, (points.y - y) / cones)
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 Towards stars at the same range every layer's separation is ``xi_l b + h_l (alpha_i - alpha_j)``, with b the baseline in
 the pupil: the sum over the layers is a function of b alone, tabulated once for each pair of sensors. Points that are
-seen from another range take a table for each layer.
+seen from another range are the business of :mod:`srtomo_srtc.layered`.
 
 A sensor's nodes are part of a square lattice. From one point to all of them the baselines differ by whole steps of
 that lattice: in a table whose grid divides the step, every node is as far beyond its grid point as the others, and one
@@ -13,7 +13,6 @@ quarter of the step: nodes that follow each other in a row are then 12 vectors, 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numba
@@ -79,41 +78,36 @@ class PairTable:
         if divisions == 1:
             first += -centres[0] % 1
         values = np.zeros((divisions, divisions, n_rows, n_columns + _COLUMNS), dtype)
-        _tabulate(
-            cones, offsets, fractions, lattice.step, lattice.rotation, table.values, 1 / table.step, first, values
-        )
+        tabulate(cones, offsets, fractions, lattice.step, lattice.rotation, table.values, 1 / table.step, first, values)
         return cls(lattice, centres, first, values)
 
 
 class Correlator:
-    """Covariance of the wavefront at points, summed over one or several tables, with a sensor's slopes.
+    """Covariance of the wavefront at points with a sensor's slopes."""
 
-    The points of all tables are the same ones, on other layers.
-    """
-
-    def __init__(self, tables: Sequence[PairTable], gradient: sparse.csr_array) -> None:
+    def __init__(self, table: PairTable, gradient: sparse.csr_array) -> None:
         """Set up.
 
         Args:
-            tables: for one sensor.
+            table: of the points and the sensor's nodes.
             gradient: (n_slopes, n_nodes) of the sensor, 1/m.
         """
-        self._tables = [((-t.centres - t.first) * len(t.values), t.values) for t in tables]
-        self._rows, where = tables[0].lattice.rows(_COLUMNS)
-        self._gradient = gradient.indptr, where[gradient.indices], gradient.data.astype(tables[0].values.dtype)
+        self._place = (-table.centres - table.first) * len(table.values)
+        self._table = table.values
+        self._rows, where = table.lattice.rows(_COLUMNS)
+        self._gradient = gradient.indptr, where[gradient.indices], gradient.data.astype(table.values.dtype)
 
     def __call__(self, points: slice) -> Matrix:
         """Of some of the points: (n_points, n_slopes) rad m."""
-        every = range(*points.indices(len(self._tables[0][0])))
-        out = np.empty((len(every), len(self._gradient[0]) - 1), self._gradient[2].dtype)
+        every = range(*points.indices(len(self._place)))
+        out = np.empty((len(every), len(self._gradient[0]) - 1), self._table.dtype)
         nodes = np.empty((min(_POINTS, len(every)), self._rows[:, 2].sum()), out.dtype)
         for start in range(0, len(every), _POINTS):
             some = every[start : start + _POINTS]
             own = nodes[: len(some)]
             own[:] = 0
-            for place, values in self._tables:
-                _add_nodes(place[some.start : some.stop], values, self._rows, own)
-            _slopes(own, *self._gradient, out[start : start + _POINTS])
+            _add_nodes(self._place[some.start : some.stop], self._table, self._rows, own)
+            slopes_of_nodes(own, *self._gradient, out[start : start + _POINTS])
         return out
 
 
@@ -124,7 +118,7 @@ def is_on_lattice(centres: Array) -> bool:
 
 
 @numba.njit(cache=True, nogil=True, fastmath={"contract"})
-def _tabulate(
+def tabulate(
     cones: Array,
     offsets: Array,
     fractions: Array,
@@ -156,30 +150,42 @@ def _tabulate(
 
 @numba.njit(cache=True, nogil=True, fastmath={"contract", "reassoc"})
 def _add_nodes(place: Array, table: Matrix, rows: Indices, out: Matrix) -> None:
-    flat, n_columns = table.reshape(-1), table.shape[3]
-    starts, weights = _taps(place, table)
+    flat, nodes, n_columns = table.reshape(-1), out.reshape(-1), table.shape[3]
+    starts, weights = find_taps(place, table)
     at = 0
     # row by row for all points: near points look into the same part of the table, while it is in the cache
     for k in range(len(rows)):
         beyond, n = rows[k, 0] * n_columns + rows[k, 1], rows[k, 2]
         for p in range(len(place)):
-            nodes, first, w = out[p, at : at + n], starts[p], weights[p]
-            if len(w) == 1:
-                nodes += flat[first[0] + beyond : first[0] + beyond + n]
-                continue
-            for i in range(0, 12, 6):
-                f0, f1, f2 = first[i] + beyond, first[i + 1] + beyond, first[i + 2] + beyond
-                f3, f4, f5 = first[i + 3] + beyond, first[i + 4] + beyond, first[i + 5] + beyond
-                t0, t1, t2 = flat[f0 : f0 + n], flat[f1 : f1 + n], flat[f2 : f2 + n]
-                t3, t4, t5 = flat[f3 : f3 + n], flat[f4 : f4 + n], flat[f5 : f5 + n]
-                w0, w1, w2, w3, w4, w5 = w[i], w[i + 1], w[i + 2], w[i + 3], w[i + 4], w[i + 5]
-                for c in range(n):
-                    nodes[c] += w0 * t0[c] + w1 * t1[c] + w2 * t2[c] + w3 * t3[c] + w4 * t4[c] + w5 * t5[c]
+            if starts.shape[1] == 12:
+                add_taps(flat, starts, beyond, weights, p, nodes, p * out.shape[1] + at, n)
+            else:
+                to, start = np.uint64(p * out.shape[1] + at), np.uint64(starts[p, 0] + beyond)
+                for c in range(np.uint64(n)):
+                    nodes[to + c] += flat[start + c]
         at += n
 
 
+@numba.njit(cache=True, nogil=True, fastmath={"contract", "reassoc"})
+def add_taps(
+    flat: Matrix, starts: Indices, beyond: int, weights: Matrix, point: int, nodes: Matrix, to: int, n: int
+) -> None:
+    """Add to ``n`` of a point's nodes, from ``to`` on, 12 weighted entries each, ``beyond`` its starts in a table."""
+    # unsigned: an index that can count from the end costs a test
+    into = np.uint64(to)
+    for i in range(0, 12, 6):
+        f0, f1 = np.uint64(starts[point, i] + beyond), np.uint64(starts[point, i + 1] + beyond)
+        f2, f3 = np.uint64(starts[point, i + 2] + beyond), np.uint64(starts[point, i + 3] + beyond)
+        f4, f5 = np.uint64(starts[point, i + 4] + beyond), np.uint64(starts[point, i + 5] + beyond)
+        w0, w1, w2 = weights[point, i], weights[point, i + 1], weights[point, i + 2]
+        w3, w4, w5 = weights[point, i + 3], weights[point, i + 4], weights[point, i + 5]
+        for c in range(np.uint64(n)):
+            first = w0 * flat[f0 + c] + w1 * flat[f1 + c] + w2 * flat[f2 + c]
+            nodes[into + c] += first + w3 * flat[f3 + c] + w4 * flat[f4 + c] + w5 * flat[f5 + c]
+
+
 @numba.njit(cache=True, nogil=True)
-def _taps(place: Array, table: Matrix) -> tuple[Indices, Matrix]:
+def find_taps(place: Array, table: Matrix) -> tuple[Indices, Matrix]:
     """Where in the flat table what belongs to baseline 0 of each point is, and how much each entry counts.
 
     Interpolated by cubics in x between the two rows next to it, and in y between the two columns, less what is in both.
@@ -193,8 +199,10 @@ def _taps(place: Array, table: Matrix) -> tuple[Indices, Matrix]:
             starts[p, 0] = np.int64(np.rint(place[p, 0])) * n_columns + np.int64(np.rint(place[p, 1]))
             continue
         fy, fx = np.int64(np.floor(place[p, 0])), np.int64(np.floor(place[p, 1]))
-        _cubic(place[p, 0] - fy, wy, ly)
-        _cubic(place[p, 1] - fx, wx, lx)
+        ty, tx = place[p, 0] - fy, place[p, 1] - fx
+        cubic(ty, wy)
+        cubic(tx, wx)
+        ly[1], ly[2], lx[1], lx[2] = 1 - ty, ty, 1 - tx, tx
         tap = 0
         for i in range(4):
             for j in range(4):
@@ -208,7 +216,7 @@ def _taps(place: Array, table: Matrix) -> tuple[Indices, Matrix]:
 
 
 @numba.njit(cache=True, nogil=True, fastmath={"contract"})
-def _slopes(nodes: Matrix, indptr: Indices, indices: Indices, data: Matrix, out: Matrix) -> None:
+def slopes_of_nodes(nodes: Matrix, indptr: Indices, indices: Indices, data: Matrix, out: Matrix) -> None:
     # the gradient is read once for four points
     for p in range(0, len(nodes), 4):
         last = len(nodes) - 1
@@ -226,10 +234,9 @@ def _slopes(nodes: Matrix, indptr: Indices, indices: Indices, data: Matrix, out:
 
 
 @numba.njit(cache=True, nogil=True)
-def _cubic(t: float, cubic: Array, linear: Array) -> None:
-    """Lagrange's, for values at -1, 0, 1 and 2, and linear interpolation from the middle two."""
-    cubic[0] = -t * (t - 1) * (t - 2) / 6
-    cubic[1] = (t + 1) * (t - 1) * (t - 2) / 2
-    cubic[2] = -(t + 1) * t * (t - 2) / 2
-    cubic[3] = (t + 1) * t * (t - 1) / 6
-    linear[1], linear[2] = 1 - t, t
+def cubic(t: float, weights: Array) -> None:
+    """Lagrange's, at t, of values at -1, 0, 1 and 2."""
+    weights[0] = -t * (t - 1) * (t - 2) / 6
+    weights[1] = (t + 1) * (t - 1) * (t - 2) / 2
+    weights[2] = -(t + 1) * t * (t - 2) / 2
+    weights[3] = (t + 1) * t * (t - 1) / 6

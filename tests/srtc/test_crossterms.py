@@ -60,6 +60,19 @@ def test_from_tables(case: Case) -> None:
     assert found.tobytes() == threaded.tobytes()
 
 
+def test_from_tables_where_mirrors_are_coarse_and_sensors_fine() -> None:
+    # neighbouring points are then far apart in the sensors' steps
+    changes: dict[str, object] = {"mirrors.0.actuators": 8, "mirrors.0.pitch": 1.3, "sensors.0.subapertures": 40}
+    system = load_system("mini", changes)
+    layout, profile = Layout(system), Profile.of(system)
+    sensors, fit = sightlines(system, layout, profile), Fit(system, layout)
+    points = [points for _, points in fit.footprints(profile.heights)]
+    turbulence = Turbulence.covering(profile, [*(s.nodes for s in sensors), *points])
+    exact = right_hand_side(fit, turbulence, sensors, profile.heights)
+    found = right_hand_side(fit, turbulence, sensors, profile.heights, fast=True)
+    assert np.linalg.norm(found - exact) < 1e-5 * np.linalg.norm(exact)
+
+
 def test_of_sensors_that_the_wind_carried_away(case: Case) -> None:
     fit, _, sensors, heights, _ = case
     mini = load_system("mini")
