@@ -129,6 +129,8 @@ def tabulate(
     first: Array,
     out: Array,
 ) -> None:
+    """Add to ``out`` the covariance, summed over layers, on a grid of baselines: see :class:`PairTable`, whose
+    ``values`` it is, and :meth:`PairTable.build`; ``per_step`` is 1 over the step (m) of the covariance's ``table``."""
     divisions, _, n_rows, n_columns = out.shape
     cosine, sine, last = np.cos(rotation) * step, np.sin(rotation) * step, len(table) - 2
     for a in range(divisions):
@@ -217,6 +219,7 @@ def find_taps(place: Array, table: Matrix) -> tuple[Indices, Matrix]:
 
 @numba.njit(cache=True, nogil=True, fastmath={"contract"})
 def slopes_of_nodes(nodes: Matrix, indptr: Indices, indices: Indices, data: Matrix, out: Matrix) -> None:
+    """Turn wavefronts at nodes (n_points, n_nodes) into slopes (n_points, n_slopes), by the gradient in CSR form."""
     # the gradient is read once for four points
     for p in range(0, len(nodes), 4):
         last = len(nodes) - 1
