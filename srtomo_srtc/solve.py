@@ -19,8 +19,9 @@ from srtomo_srtc.parallel import Progress, run, silent
 
 Matrix = NDArray[np.floating]
 
-_TILES = 16  # across, as long as they are neither so small that products are slow nor so large that threads wait
+_TILES = 24  # across, as long as they are neither so small that products are slow nor so large that threads wait
 _SMALLEST, _LARGEST = 512, 4096
+_ROWS = 1024  # divided at a time: products of half as many are a tenth slower, more would be long between two reports
 
 
 class SymmetricTiles:
@@ -75,6 +76,16 @@ class SymmetricTiles:
                     self.tiles[i][j][rows.start - top : rows.stop - top, columns.start - left : columns.stop - left] = (
                         values[rows.start - row : rows.stop - row, columns.start - column : columns.stop - column]
                     )
+
+    def part(self, which: NDArray[np.intp]) -> SymmetricTiles:
+        """Some rows and the same columns, in ascending order."""
+        out = SymmetricTiles(len(which), self.dtype)
+        bounds = np.searchsorted(which, self.starts)
+        inside = [which[a:b] - start for (a, b), start in zip(pairwise(bounds), self.starts)]
+        for i, row in enumerate(self.tiles):
+            for j, tile in enumerate(row):
+                out.write(bounds[i], bounds[j], tile[np.ix_(inside[i], inside[j])])
+        return out
 
     def dense(self) -> Matrix:
         """(n, n), exactly symmetric."""
@@ -143,7 +154,8 @@ class SymmetricTiles:
 
     def divide(self, B: Matrix, threads: int = 1, progress: Progress = silent) -> None:
         """Turn B (m, n), C-ordered, into ``B S^-1`` where it lies; after :meth:`factor`."""
-        pieces = max(threads, math.ceil(len(B) / _SMALLEST))
+        # as many for each thread
+        pieces = threads * math.ceil(len(B) / (threads * _ROWS))
         bounds = [len(B) * p // pieces for p in range(pieces + 1)]
 
         def solve(rows: slice) -> None:
