@@ -9,6 +9,7 @@ pupil's wavefront, virtual slopes or coefficients of modes, as long as they come
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -87,6 +88,40 @@ def commands_from(
     high_order = fit(estimator(S[np.ix_(lasers, lasers)], right[lasers], _within(blind, lasers)).T)
     R[:, lasers] = high_order - split.low_order @ high_order
     own = S[np.ix_(natural, natural)]
+    low_order = (own - noise[natural][:, natural].toarray()) @ split.measured[:, natural].T
+    R[:, natural] = split.answer @ estimator(own, low_order, _within(blind, natural)).T
+    return R
+
+
+def commands_from_tiles(
+    S: SymmetricTiles,
+    right: NDArray[np.floating],
+    blind: Array,
+    fit: Callable[[Any, int], NDArray[np.floating]],
+    split: Split | None,
+    noise: sparse.csr_array,
+    threads: int = 1,
+    progress: Progress = silent,
+) -> NDArray[np.floating]:
+    """As :func:`commands_from`, for many slopes: in the precision of S and ``right``, both of which are overwritten.
+
+    Args:
+        right: (n, n_slopes) Sigma_xs, C-ordered.
+        fit: x to commands as :func:`commands_from` takes it, on so many threads.
+    """
+    if split is None:
+        divide(right, S, blind, threads, progress)
+        return fit(right, threads)
+    lasers, natural = split.blind, split.seeing
+    own = S.part(natural).dense().astype(np.float64)
+    mine = right[:, lasers]
+    divide(mine, S.part(lasers), _within(blind, lasers), threads, progress)
+    high_order = fit(mine, threads)
+    del mine
+    # commands come in the place of what they were made from
+    R = right
+    R[:, lasers] = high_order
+    R[:, lasers] -= split.low_order.astype(R.dtype) @ high_order
     low_order = (own - noise[natural][:, natural].toarray()) @ split.measured[:, natural].T
     R[:, natural] = split.answer @ estimator(own, low_order, _within(blind, natural)).T
     return R

@@ -22,7 +22,7 @@ from srtomo_core.system import System
 from srtomo_srtc.atmosphere import Profile
 from srtomo_srtc.covariance import Turbulence, slope_tiles
 from srtomo_srtc.crossterms import right_hand_side
-from srtomo_srtc.estimator import commands_from, divide
+from srtomo_srtc.estimator import commands_from_tiles
 from srtomo_srtc.fitting import KAPPA, Fit
 from srtomo_srtc.gradient import OVERSAMPLING
 from srtomo_srtc.memory import require
@@ -115,19 +115,11 @@ def implicit(
     S.add(noise)
 
     stages.enter("solution", 0.55)
-    if split:
-        R = commands_from(
-            S.dense().astype(np.float64),
-            wanted.T.astype(np.float64),
-            blind,
-            fit.solve,
-            Split.of(system, layout, G),
-            noise,
-        )
-    else:
-        divide(wanted, S, blind, threads, lambda done: stages.within(done, 0.55, 1.0))
-        del S
-        R = fit.solve(wanted, threads)
+    parts = Split.of(system, layout, G) if split else None
+    R = commands_from_tiles(
+        S, wanted, blind, fit.solve, parts, noise, threads, lambda done: stages.within(done, 0.55, 1.0)
+    )
+    del S, wanted
 
     stages.enter("done", 1.0)
     reconstructor = Reconstructor.from_matrices(

@@ -29,7 +29,7 @@ from srtomo_core.system import System
 from srtomo_srtc.atmosphere import Profile
 from srtomo_srtc.covariance import Turbulence, slope_tiles
 from srtomo_srtc.crossterms import right_hand_side
-from srtomo_srtc.estimator import commands_from, divide
+from srtomo_srtc.estimator import commands_from_tiles
 from srtomo_srtc.fitting import KAPPA, Fit
 from srtomo_srtc.gradient import OVERSAMPLING
 from srtomo_srtc.memory import require
@@ -120,19 +120,11 @@ def predictive(
 
     solving = alone_is + 0.5 * (1 - alone_is)
     stages.enter(f"{epochs} exposures: solution", solving)
-    if split:
-        R = commands_from(
-            S.dense().astype(np.float64),
-            wanted.T.astype(np.float64),
-            blind,
-            fit.solve,
-            _of_several(Split.of(believed, layout, G), layout.n_slopes, epochs),
-            noise,
-        )
-    else:
-        divide(wanted, S, blind, threads, lambda done: stages.within(done, solving, 1.0))
-        del S
-        R = fit.solve(wanted, threads)
+    parts = _of_several(Split.of(believed, layout, G), layout.n_slopes, epochs) if split else None
+    R = commands_from_tiles(
+        S, wanted, blind, fit.solve, parts, noise, threads, lambda done: stages.within(done, solving, 1.0)
+    )
+    del S, wanted
 
     stages.enter("done", 1.0)
     reconstructor = Reconstructor.from_matrices(
