@@ -22,7 +22,8 @@ class Topic:
     """One row of the table.
 
     ``depth`` is a number of messages at both ends, unless ``seconds`` asks for the messages of that time at the writer
-    and the recorder (``depth`` then is a plain reader's).
+    and the recorder (``depth`` then is a plain reader's). A depth costs nothing, only messages that wait do; Fast DDS
+    keeps no more than 5000 of a topic, whatever is asked.
     """
 
     name: str
@@ -45,8 +46,9 @@ class Topic:
         }
 
 
-# Two reconstructors' blocks are kept by the writer, so that a late reader finds the current one whole.
-_BLOCKS = 512
+# At a reader, one reconstructor's at least. The writer keeps two, so that a late reader finds the current one whole,
+# and no more: they are large.
+_BLOCKS = 4096
 
 SLOPES = Topic("wfs/slopes", f"{PACKAGE}/msg/SlopeFrame", 64, seconds=1.0)
 COMMAND = Topic("hrtc/command", f"{PACKAGE}/msg/DmCommand", 64, seconds=1.0)

@@ -50,7 +50,7 @@ def demo_figure(
     top.legend(fontsize=8, loc="lower left")
     microseconds = np.asarray(latencies) * 1e6
     left.hist(microseconds, bins=np.geomspace(max(microseconds.min(), 1), max(microseconds.max(), 2), 60).tolist())
-    left.set(xscale="log", yscale="log", xlabel="last slopes taken to command ready [us]", ylabel="frames",
+    left.set(xscale="log", yscale="log", xlabel="last slopes received to command ready [us]", ylabel="frames",
              title="latency")  # fmt: skip
     mirror = layout.mirrors[0]
     shape = np.full(mirror.mask.shape, np.nan)

@@ -21,6 +21,7 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
 from srtomo_core import wire
+from srtomo_core.layout import Layout
 from srtomo_rtc import native
 from srtomo_rtc.hrtc import Hrtc
 from srtomo_rtc.realtime import Outcome
@@ -28,7 +29,13 @@ from srtomo_rtc.realtime import Outcome
 _TIMEOUT = 100_000_000  # ns between looks at what was posted when nothing comes
 _POLL = 20_000_000  # ns without a message after which polling gives way to blocking
 _LAST_WORD = Duration(nanoseconds=200_000_000)  # for readers of the last command
+_FRAMES_WAITING = 8  # as many as may be in assembly: any more would be skipped
 _CORES_TO_POLL = 4  # the middleware's threads, the executor's and the system's have to find another core
+
+
+def slopes_depth(layout: Layout) -> int:
+    """Messages that may wait at the HRTC: some frames', should each row of a sensor be a packet of its own."""
+    return max(wire.SLOPES.depth, _FRAMES_WAITING * sum(len(sensor.mask) for sensor in layout.sensors))
 
 
 class HotEndpoints:
@@ -37,6 +44,7 @@ class HotEndpoints:
 
     Args:
         node: plain node, not in any executor.
+        slopes_depth: depth of the slopes' reader, messages.
         command_depth: depth of the command's writer, messages.
         compiled: run out of the interpreter, if that can be.
         waiting: ``blocking``, ``polling`` while slopes come, or ``auto``: by the number of cores.
@@ -50,7 +58,9 @@ class HotEndpoints:
 
     room = 0
 
-    def __init__(self, node: Node, command_depth: int, compiled: bool = True, waiting: str = "auto") -> None:
+    def __init__(
+        self, node: Node, slopes_depth: int, command_depth: int, compiled: bool = True, waiting: str = "auto"
+    ) -> None:
         cores = len(os.sched_getaffinity(0))
         polling = waiting == "polling" or (waiting == "auto" and cores >= _CORES_TO_POLL)
         self._library: Any = None
@@ -67,7 +77,7 @@ class HotEndpoints:
                 self.outcome = Outcome("frame path", False, f"compiled; rclpy is used instead ({error})")
         self._received = np.zeros((self.room, 2), np.int64)
         self._subscription = node.create_subscription(
-            SlopeFrame, wire.SLOPES.name, lambda _: None, QoSProfile(**wire.SLOPES.qos()), raw=True
+            SlopeFrame, wire.SLOPES.name, lambda _: None, QoSProfile(**wire.SLOPES.qos(slopes_depth)), raw=True
         )
         self._publisher = node.create_publisher(
             DmCommand, wire.COMMAND.name, QoSProfile(**wire.COMMAND.qos(command_depth))

@@ -184,6 +184,11 @@ class Matrices:
             start += len(own)
         return out
 
+    @property
+    def largest(self) -> int:
+        """Bytes of the largest of the tiles."""
+        return max(tiles.nbytes for tiles in (*self.R_tiles, self.Q_tiles))
+
     def warm(self) -> None:
         """Touch every byte."""
         self.times(np.zeros(self._n_slopes, np.float32))

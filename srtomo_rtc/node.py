@@ -20,7 +20,6 @@ import signal
 import threading
 import time
 import traceback
-from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
@@ -50,7 +49,7 @@ from srtomo_core.ring import RingWriter, ring_path
 from srtomo_core.system import InstrumentError, load_system
 from srtomo_rtc.crew import MAX_THREADS, SPIN_NS, Crew, candidates, choose
 from srtomo_rtc.events import SCALARS, EventKind, change_fields, event_fields, state_fields
-from srtomo_rtc.hot import HotEndpoints
+from srtomo_rtc.hot import HotEndpoints, slopes_depth
 from srtomo_rtc.hrtc import Hrtc, Snapshot
 from srtomo_rtc.latency import LatencyHistogram
 from srtomo_rtc.loop import MAX_EPOCHS, LoopState, Program, Settings
@@ -164,7 +163,7 @@ class HrtcNode(LifecycleNode):
         self.create_timer(1.0, self._every_second, clock=steady)
         self._worker = ThreadPoolExecutor(max_workers=1, thread_name_prefix="staging")
         self._manifest: Manifest | None = None
-        self._early_blocks: deque[wire.ReconstructorBlock] = deque(maxlen=wire.RECONSTRUCTOR_BLOCK.depth)
+        self._early_blocks: list[wire.ReconstructorBlock] = []
         self._last_block = 0.0
         self._resend_asked = 0.0
         self._kinds: dict[int, tuple[EventKind, str]] = {}
@@ -259,6 +258,7 @@ class HrtcNode(LifecycleNode):
                 raise ValueError(f"parameter {name}: expected {' or '.join(known)}, got {self._value(name)}")
         hot = HotEndpoints(
             self._hot_node,
+            slopes_depth(layout),
             wire.COMMAND.depth_at(loop.rate),
             compiled=self._value("frame_path") == "compiled",
             waiting=self._value("waiting"),
@@ -284,7 +284,7 @@ class HrtcNode(LifecycleNode):
             hot.outcome,
             multiplying,
             realtime.lock_memory(),
-            realtime.huge_pages(),
+            realtime.huge_pages(swap.largest_matrix),
             realtime.quiet_interpreter(),
             realtime.fifo_priority(self._value("fifo_priority")),
             *self._pin_helpers(),
@@ -477,6 +477,10 @@ class HrtcNode(LifecycleNode):
             return
         if self._swap is None or self._manifest is None or block.sha256 != self._manifest.sha256:
             # blocks and manifest are two topics: a block may come before its manifest
+            # of two reconstructors at most: there may be nobody yet to use them
+            kept = {block.sha256, self._manifest.sha256 if self._manifest is not None else b""}
+            if self._early_blocks and self._early_blocks[-1].sha256 != block.sha256:
+                self._early_blocks = [other for other in self._early_blocks if other.sha256 in kept]
             self._early_blocks.append(block)
             return
         self._take(block)

@@ -18,6 +18,9 @@ from typing import NamedTuple
 _BLAS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 _MCL_CURRENT, _MCL_FUTURE = 1, 2
 
+HUGE_PAGE = 2 << 20
+"""Bytes."""
+
 
 class Outcome(NamedTuple):
     """Whether a setting was applied, and why not."""
@@ -62,11 +65,17 @@ def _kibibytes(file: str, field: str) -> int:
     return 0
 
 
-def huge_pages() -> Outcome:
-    """What of the process's memory is on huge pages: the matrices ask for them when they are made."""
+def huge_pages(largest: int) -> Outcome:
+    """What of the process's memory is on huge pages: matrices ask for them when they are made, if they fill one.
+
+    Args:
+        largest: of the matrices, bytes.
+    """
     huge = _kibibytes("smaps_rollup", "AnonHugePages")
     if huge:
         return Outcome("huge pages", True, f"{huge >> 10} MiB")
+    if largest < HUGE_PAGE:
+        return Outcome("huge pages", True, f"not needed: no matrix fills one ({largest / 2**20:.1f} MiB at most)")
     setting = Path("/sys/kernel/mm/transparent_hugepage/enabled")
     try:
         reason = f"{setting} says {setting.read_text(encoding='ascii').strip()}"

@@ -262,6 +262,10 @@ class Swap:
         kernel: float32; int16, which holds R in half the memory; tlr, which holds it in tiles of low rank. Both refuse
             what that would spoil, and tlr also what is no smaller than with int16.
 
+    Attributes:
+        settings, active, staged, previous: what the loop is to run, and what may be committed or rolled back to.
+        largest_matrix: of one sensor's or Q's, bytes.
+
     Raises:
         ValueError: G_cal is not of the instrument's shape.
     """
@@ -285,6 +289,7 @@ class Swap:
         self._post = post
         self._max_epochs = max_epochs
         self._slots = [Slot(layout, max_epochs, kernel) for _ in range(3)]
+        self.largest_matrix = max(slot.epochs[0].largest for slot in self._slots)
         self._manifest: Manifest | None = None
         self._R = np.zeros((n_parts(max_epochs), layout.n_commands, layout.n_slopes), np.float32)
         self._Q = np.zeros((n_parts(max_epochs), layout.n_commands, layout.n_commands), np.float32)

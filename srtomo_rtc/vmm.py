@@ -17,6 +17,7 @@ from numpy.typing import DTypeLike, NDArray
 
 from srtomo_rtc import native
 from srtomo_rtc.native import lib
+from srtomo_rtc.realtime import HUGE_PAGE
 
 Floats = NDArray[np.float32]
 Int16s = NDArray[np.int16]
@@ -33,7 +34,6 @@ KERNELS = {
 low rank goes on with a digest of the factors."""
 
 _INT16_MAX = 32767
-_HUGE = 2 << 20  # bytes of a huge page
 
 
 def instructions() -> str:
@@ -55,13 +55,13 @@ def tiles_shape(n_rows: int, n_columns: int, dtype: DTypeLike) -> tuple[int, int
 def huge_zeros(shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
     """An array of zeros on huge pages, where the system grants them: fewer page walks in a product."""
     size = int(np.prod(shape)) * np.dtype(dtype).itemsize
-    if size < _HUGE:
+    if size < HUGE_PAGE:
         return np.zeros(shape, dtype)
     # from one boundary to another: the system makes a page huge only if all of it is the array's
-    memory = mmap.mmap(-1, -(-size // _HUGE) * _HUGE + _HUGE)
+    memory = mmap.mmap(-1, -(-size // HUGE_PAGE) * HUGE_PAGE + HUGE_PAGE)
     if hasattr(mmap, "MADV_HUGEPAGE"):
         memory.madvise(mmap.MADV_HUGEPAGE)
-    start = -np.frombuffer(memory, np.uint8).ctypes.data % _HUGE
+    start = -np.frombuffer(memory, np.uint8).ctypes.data % HUGE_PAGE
     return np.frombuffer(memory, dtype, int(np.prod(shape)), start).reshape(shape)
 
 

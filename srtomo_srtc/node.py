@@ -110,7 +110,7 @@ class SrtcNode(Node):
         for name, default, description in parameters():
             self.declare_parameter(name, default, ParameterDescriptor(description=description, read_only=True))
         self._manifests = self._publisher(ReconstructorMsg, wire.RECONSTRUCTOR)
-        self._blocks = self._publisher(ReconstructorBlockMsg, wire.RECONSTRUCTOR_BLOCK)
+        self._blocks: Any = None
         self._profiles = self._publisher(AtmosphereProfile, wire.PROFILE)
         self._healths = self._publisher(ModelHealth, wire.HEALTH)
         self._diagnostics = self._publisher(DiagnosticArray, wire.DIAGNOSTICS)
@@ -205,7 +205,14 @@ class SrtcNode(Node):
         self._send_blocks(reconstructor, None)
 
     def _send_blocks(self, reconstructor: Reconstructor, only: Iterable[int] | None) -> None:
-        for block in reconstructor.blocks():
+        blocks = list(reconstructor.blocks())
+        if self._blocks is None:
+            # two reconstructors' are kept for late readers: any more would be memory for nothing
+            topic = wire.RECONSTRUCTOR_BLOCK
+            self._blocks = self.create_publisher(
+                ReconstructorBlockMsg, topic.name, QoSProfile(**topic.qos(2 * len(blocks)))
+            )
+        for block in blocks:
             if only is None or block.index in only:
                 self._blocks.publish(
                     wire.write_block(

@@ -44,7 +44,7 @@ def report(problem: Problem, compute: Compute, paths: Paths | None) -> tuple[lis
                 _row(f"{arrival}: {name}, last slopes received to command sent", found.inside[node], sgemv)
                 for node, name in (("echo", "echo"), ("hrtc", "HRTC"))
             ]
-            lines.append(_row(f"{arrival}: HRTC, last slopes taken to command ready", found.loop, sgemv))
+            lines.append(_row(f"{arrival}: HRTC, last slopes received to command ready", found.loop, sgemv))
     targets = [_target(f"compute, {name}, median", compute.ratio(name), most) for name, most in TARGETS.items()]
     if paths is not None:
         for arrival, most in PATH_TARGETS.items():
@@ -83,7 +83,7 @@ def numbers(problem: Problem, compute: Compute, paths: Paths | None) -> dict[str
                 arrival: {
                     "published_to_returned": _plain(latency.path),
                     "received_to_sent": _plain(latency.inside),
-                    "taken_to_ready": latency.loop._asdict(),
+                    "received_to_ready": latency.loop._asdict(),
                     "hrtc_less_echo": {"median": latency.median._asdict(), "p90": latency.p90._asdict()},
                 }
                 for arrival, latency in paths.arrivals.items()

@@ -45,7 +45,7 @@ class Turn(NamedTuple):
         received: when the node's middleware received that message; 0 where the node's queue lost some of the frame.
         answered: when the node published the command.
         returned: when the middleware received it here.
-        taken: s, DmCommand.latency: the loop's own, last slopes taken to command ready.
+        taken: s, DmCommand.latency: the loop's own, last slopes received to command ready.
     """
 
     sent: Times
@@ -66,7 +66,7 @@ class Turn(NamedTuple):
 
     @property
     def loop(self) -> NDArray[np.float64]:
-        """Last slopes taken to command ready; ns, without the warm-up."""
+        """Last slopes received to command ready; ns, without the warm-up."""
         return self.taken[self._counted] * 1e9
 
     @property

@@ -141,4 +141,4 @@ def test_the_whole_path(start_process, tmp_path: Path) -> None:
             assert whole["samples"] == 2 * 16  # a fifth of each turn is to warm up
             assert inside["samples"] >= whole["samples"] - path["frames_with_lost_slopes"][node]
             assert 0 < inside["median"] < whole["median"] < 1.0
-        assert 0 < found["taken_to_ready"]["median"] < found["published_to_returned"]["hrtc"]["median"]
+        assert 0 < found["received_to_ready"]["median"] < found["published_to_returned"]["hrtc"]["median"]

@@ -21,7 +21,7 @@ from srtomo_rtc.hrtc import Hrtc
 path, seconds = sys.argv[1], float(sys.argv[2])
 rclpy.init()
 node = Node("hrtc_hot")
-hot = HotEndpoints(node, 64, compiled=path == "compiled")
+hot = HotEndpoints(node, 64, 64, compiled=path == "compiled")
 hrtc = Hrtc(Layout(load_system("mini")), 2.0, hot.publish)
 loop = threading.Thread(target=hot.run, args=(hrtc,))
 loop.start()

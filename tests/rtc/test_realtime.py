@@ -88,11 +88,15 @@ def test_affinity():
 def test_huge_pages_are_counted_or_the_reason_told():
     code = (
         "from srtomo_rtc import realtime; from srtomo_rtc.vmm import huge_zeros;"
-        "kept = huge_zeros((16, 1024, 1024), 'f4'); kept[:] = 1; print(realtime.huge_pages())"
+        "kept = huge_zeros((16, 1024, 1024), 'f4'); kept[:] = 1; print(realtime.huge_pages(kept.nbytes))"
     )
     outcome = run(code)
     if not outcome.startswith("huge pages refused: "):
         assert 60 <= int(outcome.split()[2]) <= 80
+    small = run("from srtomo_rtc import realtime; print(realtime.huge_pages(1 << 20))")
+    assert small.startswith(
+        ("huge pages not needed: no matrix fills one (1.0 MiB at most)", f"huge pages {small.split()[2]} MiB")
+    )
 
 
 def test_the_interpreter_is_quiet():

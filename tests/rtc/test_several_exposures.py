@@ -280,6 +280,18 @@ def test_the_bag_holds_what_it_is_made_for(eventful):
     assert len({command.reconstructor for command in made.commands}) == 3
 
 
+def test_frames_that_the_fallback_answers_are_counted(eventful, mini, three):
+    """Those with the law applied and fewer such frames just before than the reconstructor looks back."""
+    made = eventful[1]
+    looks_back = {mini.a.id: 0, three.id: 2}
+    expected = fine = 0
+    for command in made.commands:
+        if command.verdict == Verdict.OK:
+            expected += fine < looks_back.get(command.reconstructor, 1)
+        fine = fine + 1 if command.verdict == Verdict.OK else 0
+    assert made.hrtc.counters.fallback == expected == 8
+
+
 def test_what_a_replay_cannot_start_from(eventful, tmp_path):
     """A bag that begins at a recorded state lacks the exposures before: said, and on it goes at the next state."""
     outcome = replay(rewrite(eventful[0], tmp_path / "late", lambda frame: frame is None or frame > 50), 51)
