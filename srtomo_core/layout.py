@@ -202,6 +202,8 @@ class Layout:
         sensors, mirrors: in the system's order.
         slope_start: (n_sensors + 1,) first slope of each sensor; the last entry is n_slopes.
         command_start: (n_mirrors + 1,) first command of each mirror; the last entry is n_commands.
+        tip_tilt_sensors: indices of the sensors that tip-tilt's own loop has, if there is one: their slopes have their
+            place in the slope vector, but come in frames of their own count.
     """
 
     def __init__(self, system: System) -> None:
@@ -210,6 +212,7 @@ class Layout:
         self.mirrors = tuple(_mirror_layout(system, mirror) for mirror in system.mirrors)
         self.slope_start = np.concatenate([[0], np.cumsum([s.n_slopes for s in self.sensors])])
         self.command_start = np.concatenate([[0], np.cumsum([m.n_actuators for m in self.mirrors])])
+        self.tip_tilt_sensors = system.tip_tilt_sensors
         for sensor in self.sensors:
             if sensor.n_valid == 0:
                 raise ValueError(f"sensor {sensor.name}: no sub-aperture is lit to its illumination_threshold")
@@ -258,7 +261,8 @@ class Layout:
                     "place": [*layout.shift, layout.rotation, layout.size],
                     "valid": np.flatnonzero(layout.mask).tolist(),
                 }
-                for sensor, layout in zip(system.sensors, self.sensors, strict=True)
+                | ({"own_count": True} if i in self.tip_tilt_sensors else {})
+                for i, (sensor, layout) in enumerate(zip(system.sensors, self.sensors, strict=True))
                 for star in [system.star_of(sensor)]
             ],
             "mirrors": [

@@ -13,10 +13,13 @@ from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import numpy as np
 import yaml
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, model_validator
 
 from srtomo_core.units import ARCSEC, Angle, Charge, Delay, Flux, Frequency, Length, Shift, Speed
+
+_WHOLE = 1e-6  # what a ratio of rates may be off a whole number, as a share
 
 Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$")]
 
@@ -212,6 +215,19 @@ class Science(_Frozen):
         return self
 
 
+class TipTiltLoop(_Frozen):
+    """Tip-tilt in a loop of its own: an integrator on the sensors whose stars see tip-tilt.
+
+    One exposure lasts a whole number of the high orders'. ``delay`` is from mid-exposure to mid-command in its own
+    frames; without one it is the least there can be (:attr:`LoopSettings.tip_tilt_wait`). ``leak`` is of a frame.
+    """
+
+    rate: Annotated[Frequency, Field(gt=0)]
+    delay: Annotated[Delay, Field(ge=1, le=8)] | None = None
+    gain: Annotated[float, Field(gt=0, le=1)]
+    leak: Annotated[float, Field(ge=0, lt=1)] = 0.0
+
+
 class LoopSettings(_Frozen):
     """Frame rate, delay from mid-exposure to mid-command, gain, and the leak of a frame."""
 
@@ -219,6 +235,50 @@ class LoopSettings(_Frozen):
     delay: Annotated[Delay, Field(ge=1, le=8)]
     gain: Annotated[float, Field(gt=0, le=1)]
     leak: Annotated[float, Field(ge=0, lt=1)] = 0.0
+    tip_tilt: TipTiltLoop | None = None
+
+    @model_validator(mode="after")
+    def _tip_tilt_in_step(self) -> LoopSettings:
+        own = self.tip_tilt
+        if own is None:
+            return self
+        ratio = self.rate / own.rate
+        if ratio < 1 - _WHOLE or abs(ratio - round(ratio)) > _WHOLE * ratio:
+            raise ValueError(f"tip_tilt.rate: expected rate ({self.rate:g} Hz) over a whole number, got {own.rate:g}")
+        frames = self.tip_tilt_frames
+        least = 1 + (self.delay - 1) / frames
+        wait = ((own.delay or least) - least) * frames
+        if wait < -_WHOLE or abs(wait - round(wait)) > 1e-3:
+            raise ValueError(
+                f"tip_tilt.delay: expected {least:g} frames, or whole exposures of the high orders (1/{frames} frame) "
+                f"more, got {own.delay:g}"
+            )
+        delay = least + self.tip_tilt_wait / frames
+        whole = math.floor(delay)
+        # of t[j] = (1 - leak) t[j-1] - g ((1-f) t[j-n] + f t[j-n-1])
+        terms = np.zeros(whole + 2)
+        terms[:2] = 1, own.leak - 1
+        terms[whole] += own.gain * (1 - (delay - whole))
+        terms[whole + 1] += own.gain * (delay - whole)
+        if np.abs(np.roots(terms)).max() >= 1:
+            raise ValueError(f"tip_tilt.gain: not stable with a delay of {delay:g} frames, got {own.gain:g}")
+        return self
+
+    @property
+    def tip_tilt_frames(self) -> int:
+        """Exposures of the high orders in one of tip-tilt's own loop; 1 without one."""
+        return 1 if self.tip_tilt is None else round(self.rate / self.tip_tilt.rate)
+
+    @property
+    def tip_tilt_wait(self) -> int:
+        """Exposures of the high orders from the end of a tip-tilt exposure to the end of that whose command has it.
+
+        With N of the high orders' exposures in one of tip-tilt's, and their delay d, a wait of L makes tip-tilt's delay
+        ``1 + (d - 1 + L) / N`` of its frames: half its exposure, L, the way to the mirror, half the command's time.
+        """
+        if self.tip_tilt is None or self.tip_tilt.delay is None:
+            return 0
+        return round((self.tip_tilt.delay - 1) * self.tip_tilt_frames - (self.delay - 1))
 
 
 class System(_Frozen):
@@ -258,7 +318,22 @@ class System(_Frozen):
             ranges = [star.altitude for star in self.guide_stars if star.altitude is not None]
             if ranges and mirror.altitude >= min(ranges):
                 raise ValueError(f"mirrors[{i}].altitude: expected below the guide stars, got {mirror.altitude:g} m")
+        if self.loop.tip_tilt is not None and not 0 < len(self.tip_tilt_sensors) < len(self.sensors):
+            raise ValueError("loop.tip_tilt: expected some sensors on stars that see tip-tilt, and some on blind ones")
         return self
+
+    @property
+    def tip_tilt_sensors(self) -> tuple[int, ...]:
+        """Indices of the sensors in tip-tilt's own loop, which count their own exposures: all whose stars see tip-tilt.
+        None without such a loop."""
+        if self.loop.tip_tilt is None:
+            return ()
+        return tuple(i for i, sensor in enumerate(self.sensors) if self.star_of(sensor).tip_tilt == "seen")
+
+    def rate_of(self, sensor: Sensor) -> float:
+        """Frame rate of a sensor, Hz."""
+        own = self.loop.tip_tilt
+        return self.loop.rate if own is None or self.star_of(sensor).tip_tilt == "blind" else own.rate
 
     @property
     def airmass(self) -> float:

@@ -173,7 +173,7 @@ def _noise(system: System, layout: Layout) -> list[Array]:
 
 
 def _subaperture_noise(system: System, sensor: Sensor, layout: SensorLayout) -> Array:
-    electrons = sensor.photons * layout.size**2 * layout.illumination / system.loop.rate
+    electrons = sensor.photons * layout.size**2 * layout.illumination / system.rate_of(sensor)
     pixel = (np.arange(sensor.pixels) - (sensor.pixels - 1) / 2) * sensor.pixel_scale
     read = sensor.read_noise**2 * sensor.pixels * (pixel**2).sum() * np.eye(2)[:, :, None]
     spot = _spot_covariance(system, sensor, layout)

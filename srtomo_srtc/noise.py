@@ -114,12 +114,13 @@ def slope_variance(sensor: Sensor, layout: SensorLayout, rate: float) -> Array:
 
 def slope_noise(system: System, sensor: Sensor, layout: SensorLayout) -> SlopeNoise:
     """Noise of a sensor on its star: elongated spots if the instrument says where its laser leaves, cut by its stop."""
-    variance = slope_variance(sensor, layout, system.loop.rate)
+    rate = system.rate_of(sensor)
+    variance = slope_variance(sensor, layout, rate)
     star = system.star_of(sensor)
     ex, ey = _elongation(system, star, layout)
     if sensor.field_stop is not None:
-        return _behind_a_stop(sensor, layout, ex, ey, system.loop.rate)
-    per_square: Array = sensor.excess_noise**2 / _electrons(sensor, layout, system.loop.rate)
+        return _behind_a_stop(sensor, layout, ex, ey, rate)
+    per_square: Array = sensor.excess_noise**2 / _electrons(sensor, layout, rate)
     return SlopeNoise(variance + np.concatenate([ex**2, ey**2]) * np.tile(per_square, 2), ex * ey * per_square)
 
 

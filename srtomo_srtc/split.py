@@ -79,7 +79,7 @@ def low_order_commands(system: System, layout: Layout) -> Array:
     stars = [system.star_of(sensor) for sensor in system.sensors]
     tilts = _shapes(system, layout, lowest)
     modes = [tilts[:, :2]]
-    if _focus_is_controlled(system, layout):
+    if focus_is_controlled(system, layout):
         modes.append(tilts[:, 2:3])
     altitude, base = layout.mirrors[highest].altitude, layout.mirrors[lowest].altitude
     if altitude > base and len({star.position for star in stars if star.tip_tilt == "seen"}) >= _PLATE_SCALE_STARS:
@@ -93,7 +93,7 @@ def low_order_commands(system: System, layout: Layout) -> Array:
     return np.hstack(modes)
 
 
-def _focus_is_controlled(system: System, layout: Layout) -> bool:
+def focus_is_controlled(system: System, layout: Layout) -> bool:
     """Whether some star is blind to focus and another, in more than one lenslet, is not."""
     stars = [system.star_of(sensor) for sensor in system.sensors]
     return any(star.focus == "blind" for star in stars) and any(
@@ -104,7 +104,7 @@ def _focus_is_controlled(system: System, layout: Layout) -> bool:
 
 def _low_orders(system: System, layout: Layout) -> Array:
     """(n_low, n_slopes) the low orders that seeing sensors measure, tip-tilt in rad whatever the number of lenslets."""
-    with_focus = _focus_is_controlled(system, layout)
+    with_focus = focus_is_controlled(system, layout)
     rows = []
     for w, sensor in enumerate(system.sensors):
         star, n_valid = system.star_of(sensor), layout.sensors[w].n_valid

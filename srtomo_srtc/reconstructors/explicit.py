@@ -26,6 +26,7 @@ from srtomo_srtc.mirrors import interaction_matrix
 from srtomo_srtc.model import blind_modes, layout_of, noise_covariance, noise_whitening, sightlines
 from srtomo_srtc.provenance import Stages, reconstructor_of
 from srtomo_srtc.raytrace import layer_grids, propagation
+from srtomo_srtc.tip_tilt import in_two_loops
 
 Array = NDArray[np.float64]
 Prior = Literal["exact", "laplacian"]
@@ -35,6 +36,7 @@ Solver = Literal["direct", "cg"]
 _COARSER = 3  # grid steps of the preconditioner's second grid
 
 
+@in_two_loops
 def explicit(
     system: System,
     layout: Layout | None = None,

@@ -28,6 +28,7 @@ from srtomo_srtc.provenance import Stages, reconstructor_of
 from srtomo_srtc.reconstructors.implicit import implicit
 from srtomo_srtc.reconstructors.least_squares import bytes_needed
 from srtomo_srtc.split import Split
+from srtomo_srtc.tip_tilt import in_two_loops
 
 Array = NDArray[np.float64]
 
@@ -40,6 +41,7 @@ DIRECTIONS = 24
 _GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
 
 
+@in_two_loops
 def glao(
     system: System,
     layout: Layout | None = None,

@@ -31,11 +31,13 @@ from srtomo_srtc.model import blind_modes, noise_covariance, sightlines
 from srtomo_srtc.provenance import Stages, provenance
 from srtomo_srtc.solve import SymmetricTiles
 from srtomo_srtc.split import Split
+from srtomo_srtc.tip_tilt import in_two_loops
 from srtomo_srtc.wind import sensors_carried, winds
 
 Array = NDArray[np.float64]
 
 
+@in_two_loops
 def implicit(
     system: System,
     layout: Layout | None = None,

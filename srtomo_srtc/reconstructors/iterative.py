@@ -30,6 +30,7 @@ from srtomo_srtc.memory import require
 from srtomo_srtc.mirrors import interaction_matrix
 from srtomo_srtc.model import blind_modes, layout_of, noise_whitening, project, sightlines
 from srtomo_srtc.provenance import Stages, reconstructor_of
+from srtomo_srtc.tip_tilt import in_two_loops
 from srtomo_srtc.toeplitz import ToeplitzCovariance
 
 Array = NDArray[np.float64]
@@ -39,6 +40,7 @@ _RANK = 0.25  # of the preconditioner, of the slopes
 _LARGEST_RANK = 1024
 
 
+@in_two_loops
 def iterative(
     system: System,
     layout: Layout | None = None,

@@ -28,6 +28,7 @@ from srtomo_srtc.model import blind_modes, layout_of, noise_covariance, sightlin
 from srtomo_srtc.provenance import Stages, reconstructor_of
 from srtomo_srtc.reconstructors.least_squares import weighted_inverse
 from srtomo_srtc.split import Split
+from srtomo_srtc.tip_tilt import in_two_loops
 from srtomo_srtc.wind import sensors_carried, winds
 
 Array = NDArray[np.float64]
@@ -36,6 +37,7 @@ KAPPA = 3e-4
 """Default regularisation of the control matrix, relative to the mean diagonal of the normal equations."""
 
 
+@in_two_loops
 def learn_apply(
     system: System,
     layout: Layout | None = None,

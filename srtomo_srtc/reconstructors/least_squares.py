@@ -23,6 +23,7 @@ from srtomo_srtc.memory import require
 from srtomo_srtc.mirrors import interaction_matrix
 from srtomo_srtc.model import blind_modes, layout_of, noise_whitening
 from srtomo_srtc.provenance import Stages, reconstructor_of
+from srtomo_srtc.tip_tilt import in_two_loops
 
 Array = NDArray[np.float64]
 
@@ -30,6 +31,7 @@ KAPPA = 1e-3
 """Default regularisation, relative to the mean diagonal of ``D^T N^-1 D``."""
 
 
+@in_two_loops
 def least_squares(
     system: System,
     layout: Layout | None = None,

@@ -44,6 +44,8 @@ def moao(
     Raises:
         ValueError: no such target; or as ``implicit``.
     """
+    if system.loop.tip_tilt is not None:
+        raise ValueError("loop.tip_tilt: its stars would have to see the mirror, which here no sensor does")
     n_targets = len(system.science.targets)
     if not 0 <= target < n_targets:
         raise ValueError(f"target: expected 0 to {n_targets - 1}, got {target}")

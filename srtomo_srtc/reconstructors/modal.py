@@ -33,6 +33,7 @@ from srtomo_srtc.mirrors import influence, interaction_matrix
 from srtomo_srtc.model import blind_modes, layout_of, noise_covariance, sightlines
 from srtomo_srtc.provenance import Stages, reconstructor_of
 from srtomo_srtc.split import Split
+from srtomo_srtc.tip_tilt import in_two_loops
 
 Array = NDArray[np.float64]
 
@@ -59,6 +60,7 @@ class LayerModes:
     wavefronts: Array
 
 
+@in_two_loops
 def modal(
     system: System,
     layout: Layout | None = None,

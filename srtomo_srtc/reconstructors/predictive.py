@@ -38,9 +38,11 @@ from srtomo_srtc.provenance import Stages, provenance
 from srtomo_srtc.reconstructors.implicit import Array, implicit
 from srtomo_srtc.solve import SymmetricTiles
 from srtomo_srtc.split import Split
+from srtomo_srtc.tip_tilt import in_two_loops
 from srtomo_srtc.wind import effective_lag, sensors_carried, winds, with_trusted_winds
 
 
+@in_two_loops
 def predictive(
     system: System,
     layout: Layout | None = None,
