@@ -125,6 +125,7 @@ class DmCommand(NamedTuple):
     loop_state: int
     n_clipped: int
     gain: float
+    tip_tilt_frame: int
     mirror_frame: int
     mirror_frame_before: int
     mirror_fraction: float
@@ -151,7 +152,7 @@ _ENCAPSULATION = b"\x00\x01\x00\x00"  # little-endian CDR
 _STAMP = struct.Struct("<iI")
 _LENGTH = struct.Struct("<I")
 _SLOPES = struct.Struct("<QQ32sHHHHqqfI")
-_COMMAND = struct.Struct("<QQQIIBBHfqqffI")
+_COMMAND = struct.Struct("<QQQIIBBHfqqqffI")
 _BLOCK = struct.Struct("<Q32sIIB3xIIII")
 _FLOAT = np.dtype("<f4")
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from srtomo_core.layout import Layout
 from srtomo_core.reconstructor import Reconstructor
+from srtomo_core.system import TipTiltLoop
 from srtomo_rtc.loop import Loop, Program, Settings, Slot, Verdict
 from srtomo_rtc.lowrank import Factors
 from srtomo_sim.plant import Plant
@@ -49,13 +50,15 @@ def program_of(
     return Program(slot, settings or plain_settings(layout))
 
 
-def plain_settings(layout: Layout, leak: float = 0.0) -> Settings:
-    """Pseudo-open-loop control, no offset, no limit but the mirrors' stroke."""
+def plain_settings(layout: Layout, leak: float = 0.0, tip_tilt: TipTiltLoop | None = None) -> Settings:
+    """Pseudo-open-loop control, no offset, no limit but the mirrors' stroke; ``tip_tilt`` in a loop of its own."""
     return Settings(
         id=1,
         offset=np.zeros(layout.n_commands, np.float32),
         slope_reference=np.zeros(layout.n_slopes, np.float32),
         leak=leak,
+        tip_tilt_gain=tip_tilt.gain if tip_tilt is not None else 0.0,
+        tip_tilt_leak=tip_tilt.leak if tip_tilt is not None else 0.0,
     )
 
 
@@ -81,6 +84,7 @@ def run(
     loop.post(programs[0])
     loop.prepare()
     loop.request(closed)
+    own_sensors = sum(1 << w for w in sky.layout.tip_tilt_sensors)
     rows = []
     for k in range(sky.n_frames if frames is None else frames):
         if k in programs:
@@ -91,8 +95,11 @@ def run(
         if k % sky.science_every == 0:
             error = plant.wfe(k)
             rows.append((k, error.high_order, error.tip_tilt))
+        if (stars := plant.tip_tilt(k)) is not None:
+            loop.give_tip_tilt(stars[0], own_sensors, stars[1])
         for w in range(loop.n_sensors):
-            loop.add(w, slopes[sky.layout.slopes_of(w)])
+            if loop.all_sensors >> w & 1:
+                loop.add(w, slopes[sky.layout.slopes_of(w)])
         verdict = loop.answer(on.frame, on.before, on.fraction)
         assert verdict in (Verdict.OK, Verdict.OPEN)
         plant.command(k, loop.command)

@@ -28,6 +28,7 @@ class EventKind(enum.IntEnum):
 
 SCALARS = (
     "polc", "leak", "relaxation", "command_limit", "slew_limit", "rms_limit", "gain_ramp", "fault_budget", "watchdog",
+    "tip_tilt_gain", "tip_tilt_leak",
 )  # fmt: skip
 """Of Settings: what an operator sets by a parameter of that name, and what HrtcEvent carries under it."""
 
@@ -99,6 +100,8 @@ def state_fields(snapshot: Snapshot) -> dict[str, Any]:
         "state": _floats(snapshot.state),
         "n_frames": len(snapshot.history),
         "history": _floats(snapshot.history),
+        "tip_tilt_frame": snapshot.tip_tilt_frame,
+        "tip_tilt": _floats(snapshot.tip_tilt),
     }
     if snapshot.program is not None:
         slot = snapshot.program.slot

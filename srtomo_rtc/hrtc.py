@@ -6,6 +6,9 @@ one is complete, or two later ones have begun) is held, and so are whole frames 
 Duplicates, late ones, other sessions, other instruments and damaged messages are counted and dropped. One stray frame
 number does not move the loop: a jump of the count is believed when a second exposure agrees, and the count of a session
 never goes back.
+
+Stars of tip-tilt's own loop count their own frames. Such a frame is taken in with the next answer once every star has
+come that came in the frame before, or once a later one begins; of several that wait for an answer the newest is.
 """
 
 from __future__ import annotations
@@ -78,6 +81,8 @@ class Snapshot(NamedTuple):
     first_frame: int
     state: Floats
     history: Floats
+    tip_tilt_frame: int
+    tip_tilt: Floats
 
 
 _T = TypeVar("_T")
@@ -165,6 +170,11 @@ class Hrtc:
     def last_slopes_ns(self) -> int:
         """When the last usable message came (monotonic)."""
         return int(self._c.last_slopes_ns)
+
+    @property
+    def last_tip_tilt_ns(self) -> int:
+        """When the last usable message of tip-tilt's own stars came (monotonic); 0: none has."""
+        return int(self._c.last_tip_tilt_ns)
 
     @property
     def counters(self) -> Counters:
@@ -279,6 +289,7 @@ class Hrtc:
         rows = [(c.frame + 1 - n + i) % HISTORY for i in range(n)]
         made = Snapshot(c.stamp_sec, c.stamp_nanosec, c.session, c.frame, LoopState(c.loop_state),
                         loop.program_named(c.token), c.consecutive_holds, c.frames_closed, c.first_frame, state,
-                        history[rows].copy())  # fmt: skip
+                        history[rows].copy(), c.tip_tilt_frame,
+                        native.view(self._owner, c.tip_tilt, (n_rows,))[:m].copy())  # fmt: skip
         lib.srt_gate_snapshot_done(self.gate)
         return made

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from bisect import bisect_right
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -100,13 +100,14 @@ class _Stream(NamedTuple):
 @dataclass
 class _Session:
     slopes: dict[_Stream, FrameSet] = field(default_factory=dict)
+    stars: dict[_Stream, FrameSet] = field(default_factory=dict)  # of tip-tilt's own loop, by their own count
     commands: FrameSet = field(default_factory=FrameSet)
     last_answer: int = -1  # highest number of a command that answers slopes, or their absence
     adopted: list[int] = field(default_factory=list)  # first frames that the HRTC said it would answer
     last_arrival: float = 0.0
 
     def complete(self, n_subapertures: int) -> FrameSet:
-        """Frames that hold every sub-aperture and a command."""
+        """Frames that hold every sub-aperture of the sensors that share a count, and a command."""
         if sum(stream.n_subapertures for stream in self.slopes) != n_subapertures:
             return FrameSet()
         frames = self.commands
@@ -156,6 +157,7 @@ class Ledger:
         n_subapertures: valid sub-apertures of each sensor.
         fingerprint: of the layout; slopes of another instrument are counted apart.
         in_flight: frames that may be under way between sensor and recorder when it starts or stops.
+        tip_tilt_sensors: those that count their own frames, each from the first that came to the last.
         clock: seconds, monotonic.
     """
 
@@ -165,8 +167,10 @@ class Ledger:
         fingerprint: bytes,
         in_flight: int,
         clock: Callable[[], float] = time.monotonic,
+        tip_tilt_sensors: Collection[int] = (),
     ) -> None:
-        self._n_subapertures = sum(n_subapertures)
+        self._n_subapertures = sum(n for w, n in enumerate(n_subapertures) if w not in tip_tilt_sensors)
+        self._tip_tilt_sensors = tip_tilt_sensors
         self._fingerprint = fingerprint
         self._in_flight = in_flight
         self._clock = clock
@@ -195,9 +199,10 @@ class Ledger:
         session = self._session(message.session)
         session.last_arrival = self._clock()
         stream = _Stream(message.sensor, message.first_subaperture, message.n_subapertures)
-        have = session.slopes.get(stream)
+        streams = session.stars if message.sensor in self._tip_tilt_sensors else session.slopes
+        have = streams.get(stream)
         if have is None:
-            have = session.slopes[stream] = FrameSet()
+            have = streams[stream] = FrameSet()
         self.duplicate_slopes += not have.add(message.frame)
 
     def add_command(self, buffer: bytes) -> None:
@@ -219,7 +224,9 @@ class Ledger:
         self._session(session).adopted.append(first_frame)
 
     def _gaps(self, session: _Session) -> tuple[dict[_Stream, list[tuple[int, int]]], list[tuple[int, int]]]:
-        return session.gaps(self._in_flight, self._clock() - session.last_arrival > _QUIET)
+        by_stream, unanswered = session.gaps(self._in_flight, self._clock() - session.last_arrival > _QUIET)
+        stars = {stream: list(have.gaps(have.first, have.last)) for stream, have in session.stars.items()}
+        return by_stream | stars, unanswered
 
     @property
     def frames(self) -> int:
@@ -246,7 +253,7 @@ class Ledger:
                 {
                     "sensor": stream.sensor,
                     "first_subaperture": stream.first_subaperture,
-                    "recorded": len(session.slopes[stream]),
+                    "recorded": len((session.slopes | session.stars)[stream]),
                     "lost": _total(gaps),
                     "gaps": gaps[:_GAPS_REPORTED],
                 }

@@ -19,6 +19,21 @@ What limits a command acts in this order, and the state follows what was put on 
 command whose rms over all actuators is too large is scaled down, its shape kept; the slew limit. After closing the gain
 may rise in a ramp: in frame j of N (from 1) ``j g / N`` stands for every g above.
 
+Tip-tilt may have a loop of its own, on stars that count their own frames j (:class:`srtomo_core.system.TipTiltLoop`)::
+
+    t[j] = keep t[j-1] + g_t R_t (y_t[j] - y_ref),        m[k] = clip(u[k] + o + t)
+
+with the newest t of the stars' frames that have come, one at most an answer, and held high orders are no reason to hold
+t. R_t is the reconstructor's columns for those stars; each star's is the whole of tip-tilt in its weight
+(:attr:`Slot.star_weights`), so that the rest goes on with ``R_t / (sum of their weights)`` when one is lost: no slopes
+of it, or none that are finite. With the last one t is held; so it is where it would leave the range of an actuator.
+An open loop relaxes it like u.
+
+t is no part of the state u, or the filter of the high orders would integrate it a second time. But u~ has it, being all
+that is on the mirror but o: ``y + G (u~ + t~)`` are the open-loop slopes, of which R for blind stars takes no tip-tilt
+(:mod:`srtomo_srtc.tip_tilt`). Without t~, what those stars do see of t, the mirror's ripple on a tilt, would come back
+as u.
+
 The history holds m, indexed by exposure, and o is taken off when it is used: an offset and its slope reference
 ``y_ref = -G o`` then change together without a transient, whatever the delay.
 
@@ -93,6 +108,7 @@ class Settings:
         fault_budget: consecutive held frames after which the loop opens.
         watchdog: s without slopes after which a closed loop opens, at least 0.1; 0: never.
         offset: (n_commands,) m of wavefront.
+        tip_tilt_gain, tip_tilt_leak: of tip-tilt's own loop, per frame of its own, where there is one.
         slope_reference: (n_slopes,) rad; ``-G offset`` for a wanted static shape, 0 for an aberration to be corrected.
     """
 
@@ -108,10 +124,15 @@ class Settings:
     gain_ramp: int = 0
     fault_budget: int = 50
     watchdog: float = 0.0
+    tip_tilt_gain: float = 0.0
+    tip_tilt_leak: float = 0.0
 
     def __post_init__(self) -> None:
         # as they travel in events: a replay must compute with the same numbers
-        for name in ("leak", "relaxation", "command_limit", "slew_limit", "rms_limit", "watchdog"):
+        for name in (
+            "leak", "relaxation", "command_limit", "slew_limit", "rms_limit", "watchdog", "tip_tilt_gain",
+            "tip_tilt_leak",
+        ):  # fmt: skip
             object.__setattr__(self, name, float(np.float32(getattr(self, name))))
 
 
@@ -208,6 +229,20 @@ class Matrices:
         return made
 
 
+def star_weights(layout: Layout, R: Floats) -> Floats:
+    """(n_sensors,) of each of tip-tilt's own stars in the mean of them that R_t takes; 0 for other sensors.
+
+    A star's columns are its weight times a rotation of what all have in common, for the mean of its sub-apertures:
+    their length tells the weight. Exactly rounded sums give the same bits on every machine.
+    """
+    lengths = np.zeros(len(layout.sensors))
+    for w in layout.tip_tilt_sensors:
+        squares = R[:, layout.slopes_of(w)].astype(np.float64) ** 2
+        lengths[w] = math.sqrt(layout.sensors[w].n_valid * math.fsum(squares.flat))
+    total = math.fsum(lengths)
+    return (lengths / total if total else lengths).astype(np.float32)
+
+
 class Slot:
     """Memory for one reconstructor. Made once, filled off the loop.
 
@@ -217,6 +252,7 @@ class Slot:
         n_epochs: of the reconstructor in it.
         epochs: matrices of each epoch that there is room for, the newest exposure first.
         fallback: for the newest exposure alone; the first epoch's where there is room for no more.
+        star_weights: (n_sensors,) :func:`star_weights` of it.
     """
 
     def __init__(self, layout: Layout, max_epochs: int = 1, kernel: str = "float32") -> None:
@@ -228,6 +264,8 @@ class Slot:
         self.fallback = Matrices(layout, kernel) if max_epochs > 1 else self.epochs[0]
         self.slope_reference = np.zeros(layout.n_slopes, np.float32)
         self.command_limit = np.zeros(m, np.float32)
+        self.star_weights = np.zeros(len(layout.sensors), np.float32)
+        self._layout = layout
         self.gain = 0.0
         self.id = 0
         self.sha256 = bytes(32)
@@ -251,9 +289,18 @@ class Slot:
         self.kernel_name = "-".join([KERNELS[self.kernel], *(own.digest().hex()[:16] for own in factors)])
         self.slope_reference[:] = reconstructor.slope_reference
         self.command_limit[:] = reconstructor.command_limit
+        self.star_weights[:] = star_weights(self._layout, reconstructor.parts[-1][0])
         self.gain = reconstructor.gain
         self.sha256 = reconstructor.sha256
         self.id = reconstructor.id
+
+    def divided(self, slope_reference: Floats) -> tuple[Floats, Floats]:
+        """A slope reference (n_slopes,) for the high orders, and that for tip-tilt's own stars, x0 y0 x1 y1 ...."""
+        high, stars = slope_reference.copy(), np.zeros_like(slope_reference)
+        for own in map(self._layout.slopes_of, self._layout.tip_tilt_sensors):
+            stars[own] = slope_reference[own].reshape(2, -1).T.ravel()
+            high[own] = 0
+        return high, stars
 
 
 _tokens = itertools.count(1)
@@ -281,7 +328,8 @@ class Program:
         several = slot.n_epochs > 1
         alone = slot.fallback if several else slot.epochs[0]
         epochs = slot.epochs[: slot.n_epochs]
-        slope_reference = settings.slope_reference + slot.slope_reference
+        whole_reference = settings.slope_reference + slot.slope_reference
+        slope_reference, star_reference = slot.divided(whole_reference)
         alone_reference = alone.times(slope_reference)
         n_rows = len(alone_reference)
         reference = np.zeros_like(alone_reference)
@@ -295,10 +343,11 @@ class Program:
             _padded(limit, n_rows),
             reference,
             alone_reference,
+            star_reference,
             (native.Matrices * len(epochs))(*(part.native() for part in epochs)),
             alone.native(),
         )
-        offset, limits, all_epochs, one, *matrices = self._held
+        offset, limits, all_epochs, one, stars, *matrices = self._held
         self.native = native.Program(
             self.token,
             slot.id,
@@ -317,6 +366,12 @@ class Program:
             *(vector.ctypes.data for vector in (offset, limits, all_epochs, one)),
             matrices[0],
             ctypes.pointer(matrices[1]),
+            native.TipTiltLaw(
+                settings.tip_tilt_gain,
+                1.0 - settings.tip_tilt_leak,
+                (ctypes.c_float * native.MAX_SENSORS)(*slot.star_weights),
+                stars.ctypes.data,
+            ),
         )
 
     def warm(self) -> None:
@@ -338,7 +393,7 @@ class Owner:
         weakref.finalize(self, free, pointer).atexit = False
 
 
-def check_size(layout: Layout, delay: float, max_epochs: int) -> tuple[Any, int, int, float, int]:
+def check_size(layout: Layout, delay: float, max_epochs: int) -> tuple[Any, int, int, float, int, int]:
     """What the library makes a loop from.
 
     Raises:
@@ -352,7 +407,7 @@ def check_size(layout: Layout, delay: float, max_epochs: int) -> tuple[Any, int,
     if n > native.MAX_SENSORS:
         raise ValueError(f"sensors: expected at most {native.MAX_SENSORS}, got {n}")
     counts = (ctypes.c_uint32 * n)(*(sensor.n_valid for sensor in layout.sensors))
-    return counts, n, layout.n_commands, delay, max_epochs
+    return counts, n, layout.n_commands, delay, max_epochs, sum(1 << w for w in layout.tip_tilt_sensors)
 
 
 class Loop:
@@ -364,6 +419,7 @@ class Loop:
     Attributes:
         command: (n_commands,) the last answer m, m of wavefront.
         state: (n_commands,) u after it.
+        tip_tilt: (n_commands,) t after it, m of wavefront.
         max_epochs: exposures that a reconstructor may use.
     """
 
@@ -384,10 +440,12 @@ class Loop:
         self.delay = float(np.float32(delay))  # as it travels in events
         self.max_epochs = max_epochs
         self.n_sensors, self.all_sensors = int(c.n_sensors), int(c.all_sensors)
+        self._n_slopes = layout.n_slopes
         m, n_rows = layout.n_commands, int(c.n_rows)
         self._counts = tuple(sensor.n_slopes for sensor in layout.sensors)
         self.command: Floats = native.view(made, c.command, (n_rows,))[:m]
         self.state: Floats = native.view(made, c.state, (n_rows,))[:m]
+        self.tip_tilt: Floats = native.view(made, c.tip_tilt.command, (n_rows,))[:m]
         self._history: Floats = native.view(made, c.history, (HISTORY, n_rows))[:, :m]
         self._programs: dict[int, Program] = {}
 
@@ -414,8 +472,19 @@ class Loop:
         return int(self._c.sensors)
 
     @property
+    def tip_tilt_frame(self) -> int:
+        """The newest of tip-tilt's own frames in the last answer; -1: none."""
+        return int(self._c.tip_tilt.frame)
+
+    @property
+    def tip_tilt_counts(self) -> dict[str, int]:
+        """Of tip-tilt's own frames, since the loop was made: ``frames``, ``partial``, ``held`` and ``skipped``, as
+        HrtcStatus has them."""
+        return {name: int(getattr(self._c.tip_tilt, name)) for name in native.TIP_TILT_COUNTERS}
+
+    @property
     def used(self) -> int:
-        """The sensors that had come when the last frame was answered."""
+        """The sensors that had come when the last frame was answered, and those of tip-tilt's own that it took in."""
         return int(self._c.used)
 
     @property
@@ -550,6 +619,7 @@ class Loop:
         consecutive_holds: int,
         frames_closed: int,
         exposures: Mapping[int, tuple[Sequence[Floats], tuple[int, int, float]]] | None = None,
+        tip_tilt: tuple[int, Floats] | None = None,
     ) -> None:
         """Continue after ``frame`` with a recorded state. Not while running.
 
@@ -557,12 +627,15 @@ class Loop:
             history: the commands up to that of ``frame``, the last row.
             exposures: of earlier frames that were answered OK, by frame: the slopes of each sensor, and what was on the
                 mirror, as in DmCommand. Of more than ``max_epochs - 1`` only the newest matter.
+            tip_tilt: of its own loop, the newest frame and t (n_commands,).
         """
         self.start(first_frame, loop_state)
         self._c.frame = frame + 1
         self._c.consecutive_holds = consecutive_holds
         self._c.frames_closed = frames_closed
         self.state[:] = state
+        if tip_tilt is not None:
+            self._c.tip_tilt.frame, self.tip_tilt[:] = tip_tilt
         for row, command in enumerate(history[-HISTORY:], start=frame + 1 - len(history[-HISTORY:])):
             self._history[row % HISTORY] = command
         for earlier, (slopes, mirror) in (exposures or {}).items():
@@ -579,11 +652,25 @@ class Loop:
         lib.srt_loop_prepare(self._pointer)
 
     def add(self, sensor: int, slopes: Floats) -> None:
-        """Take one sensor's slopes (n_slopes_w,) of the frame and form its product; they are copied."""
+        """Take the slopes (n_slopes_w,) of one of the high orders' sensors and form their product; they are copied."""
+        if not self.all_sensors >> sensor & 1:
+            raise ValueError(f"sensor {sensor}: its star is one of tip-tilt's own loop")
         values = np.ascontiguousarray(slopes, np.float32)
         if values.shape != (self._counts[sensor],):
             raise ValueError(f"sensor {sensor}: expected {self._counts[sensor]} slopes, got shape {values.shape}")
         lib.srt_loop_add(self._pointer, sensor, values.ctypes.data)
+
+    def give_tip_tilt(self, frame: int, sensors: int, slopes: Floats) -> None:
+        """Have the next answer take one of tip-tilt's own frames in, unless the loop is open; as the frame gate does.
+
+        Args:
+            sensors: bit w set: sensor w is one of its stars, and came with finite slopes.
+            slopes: (n_slopes,) of which those stars' count, rad.
+        """
+        values = np.ascontiguousarray(slopes, np.float32)
+        if values.shape != (self._n_slopes,):
+            raise ValueError(f"expected {self._n_slopes} slopes, got shape {values.shape}")
+        lib.srt_tip_tilt_give(self._pointer, frame, sensors & self._c.tip_tilt.sensors, values.ctypes.data)
 
     def answer(self, mirror_frame: int, mirror_frame_before: int, mirror_fraction: float) -> Verdict:
         """Answer a frame whose sensors were all added; the arguments are SlopeFrame's."""

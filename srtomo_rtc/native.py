@@ -98,6 +98,12 @@ class Matrices(Structure):
     ]
 
 
+class TipTiltLaw(Structure):
+    """``srt_tip_tilt_law``."""
+
+    _fields_ = [("gain", c_float), ("keep", c_float), ("weight", c_float * MAX_SENSORS), ("reference", c_void_p)]
+
+
 class Program(Structure):
     """``srt_program``."""
 
@@ -122,6 +128,22 @@ class Program(Structure):
         ("alone_reference", c_void_p),
         ("epochs", POINTER(Matrices)),
         ("alone", POINTER(Matrices)),
+        ("tip_tilt", TipTiltLaw),
+    ]
+
+
+TIP_TILT_COUNTERS = ("frames", "partial", "held", "skipped")
+
+
+class TipTilt(Structure):
+    """``srt_tip_tilt``."""
+
+    _fields_ = [
+        ("sensors", c_uint32),
+        ("used", c_uint32),
+        ("frame", c_int64),
+        *((name, c_uint64) for name in TIP_TILT_COUNTERS),
+        ("command", c_void_p),
     ]
 
 
@@ -159,6 +181,7 @@ class Loop(Structure):
         ("command", c_void_p),
         ("state", c_void_p),
         ("history", c_void_p),
+        ("tip_tilt", TipTilt),
     ]
 
 
@@ -234,6 +257,8 @@ class Snapshot(Structure):
         ("loop_state", c_int32),
         ("state", c_void_p),
         ("history", c_void_p),
+        ("tip_tilt_frame", c_int64),
+        ("tip_tilt", c_void_p),
     ]
 
 
@@ -256,6 +281,7 @@ class Gate(Structure):
         ("loop", POINTER(Loop)),
         ("session", c_uint64),
         ("last_slopes_ns", c_int64),
+        ("last_tip_tilt_ns", c_int64),
         ("counters", Counters),
         ("latency", Latency),
         ("frame_latency", Latency),
@@ -294,7 +320,7 @@ _FUNCTIONS: dict[str, tuple[Any, tuple[Any, ...]]] = {
     "srt_low_rank_multiply": (None, (c_void_p, POINTER(LowRank), c_uint32, c_uint32, c_void_p, c_void_p)),
     "srt_loop_use": (None, (_LOOP, c_void_p)),
     "srt_interleave": (None, (c_void_p, c_size_t, c_void_p)),
-    "srt_loop_new": (_LOOP, (_WORDS, c_uint32, c_uint32, c_float, c_uint32)),
+    "srt_loop_new": (_LOOP, (_WORDS, c_uint32, c_uint32, c_float, c_uint32, c_uint32)),
     "srt_loop_free": (None, (_LOOP,)),
     "srt_loop_start": (None, (_LOOP, c_int64, c_int)),
     "srt_loop_forget": (None, (_LOOP,)),
@@ -309,7 +335,8 @@ _FUNCTIONS: dict[str, tuple[Any, tuple[Any, ...]]] = {
     "srt_loop_pending": (c_int, (_LOOP,)),
     "srt_received": (c_int64, (c_int64, c_int64)),
     "srt_latency_add": (None, (POINTER(Latency), c_int64)),
-    "srt_gate_new": (_GATE, (_WORDS, c_uint32, c_uint32, c_float, c_uint32, c_char_p, c_int64, c_int64)),
+    "srt_tip_tilt_give": (None, (_LOOP, c_int64, c_uint32, c_void_p)),
+    "srt_gate_new": (_GATE, (_WORDS, c_uint32, c_uint32, c_float, c_uint32, c_uint32, c_char_p, c_int64, c_int64)),
     "srt_gate_free": (None, (_GATE,)),
     "srt_gate_start": (None, (_GATE,)),
     "srt_gate_offer": (c_int64, (_GATE, c_char_p, c_size_t, c_int64)),

@@ -60,6 +60,7 @@ from srtomo_rtc.vmm import KERNELS, instructions
 _ADOPTION_TIMEOUT = 2.0  # s for the loop to take up what was posted: it does between two frames, or at once if idle
 _RESEND_AFTER = 1.0  # s without a new block before missing ones are asked for
 _SILENT = 0.1  # s without slopes that are worth a warning
+_SILENT_STARS = 1.0  # s without slopes of tip-tilt's own stars, which are slow, that are worth a warning
 _GIVE_UP_AFTER = 10.0  # s without a new block before a transfer is refused
 _MESSAGE_HEAD = 192  # bytes of a message in the ring beside its slopes or commands, about
 _LEAST_RING = 1 << 20  # bytes
@@ -118,6 +119,8 @@ _PARAMETERS: tuple[tuple[str, Any, ParameterDescriptor], ...] = (
     ("gain_ramp", 0, _integer("frames in which the gain rises once the loop is closed; 0: at once", 0, 1_000_000)),
     ("fault_budget", 50, _integer("consecutive held frames after which the loop opens", 1, 1_000_000)),
     ("watchdog", 10.0, _number("s without slopes after which a closed loop opens, above 0.1; 0: never", 0.0, 3600.0)),
+    ("tip_tilt_gain", 0.0, _number("of tip-tilt's own loop; 0 at configure: the instrument's", 0.0, 1.0)),
+    ("tip_tilt_leak", 0.0, _number("of a frame of its own; 0 at configure: the instrument's", 0.0, 0.999)),
 )
 
 
@@ -236,11 +239,15 @@ class HrtcNode(LifecycleNode):
         if not self._value("interaction_matrix"):
             raise ReconstructorError("parameter interaction_matrix: expected a file made by 'srtomo calibrate'")
         G_cal = load_interaction_matrix(self._value("interaction_matrix"), layout.fingerprint)
+        values = {name: self._value(name) for name in SCALARS}
+        of_instrument = {"leak": system.loop.leak}
+        if (own := system.loop.tip_tilt) is not None:
+            of_instrument |= {"tip_tilt_gain": own.gain, "tip_tilt_leak": own.leak}
         settings = Settings(
             id=1,
             offset=np.zeros(layout.n_commands, np.float32),
             slope_reference=np.zeros(layout.n_slopes, np.float32),
-            **{name: self._value(name) for name in SCALARS} | {"leak": self._value("leak") or system.loop.leak},
+            **values | {name: value for name, value in of_instrument.items() if not values[name]},
         )
         asked = self._value("kernel")
         if asked not in ("auto", *KERNELS):
@@ -753,6 +760,10 @@ class HrtcNode(LifecycleNode):
                 for name, value in latency.summary().items():
                     setattr(message, f"{before}latency_{name}", value)
             message.offload_tip, message.offload_tilt = self._offload.look(loop, hrtc.session)
+            message.tip_tilt_frame = loop.tip_tilt_frame
+            for name, value in loop.tip_tilt_counts.items():
+                setattr(message, f"tip_tilt_{name}", value)
+            message.tip_tilt_silence = self._tip_tilt_silence(hrtc)
             message.silence = (time.monotonic_ns() - hrtc.last_slopes_ns) * 1e-9 if hrtc.session else math.inf
         self._status.publish(message)
         self._last_status = message
@@ -770,6 +781,11 @@ class HrtcNode(LifecycleNode):
         message = DiagnosticArray(status=[status])
         message.header.stamp = self.get_clock().now().to_msg()
         self._diagnostics.publish(message)
+
+    @staticmethod
+    def _tip_tilt_silence(hrtc: Hrtc) -> float:
+        last = hrtc.last_tip_tilt_ns
+        return (time.monotonic_ns() - last) * 1e-9 if last else math.inf
 
     def _health(self) -> tuple[bytes, str]:
         hrtc = self._hrtc
@@ -789,6 +805,9 @@ class HrtcNode(LifecycleNode):
             return DiagnosticStatus.OK, "waiting for slopes"
         if silent:
             return DiagnosticStatus.WARN, silent
+        starless = self._tip_tilt_silence(hrtc)
+        if self._layout.tip_tilt_sensors and starless > _SILENT_STARS:
+            return DiagnosticStatus.WARN, f"{state}; no slopes of tip-tilt's own stars for {starless:.1f} s: it is held"
         misses, self._misses_told = hrtc.latency.misses - self._misses_told, hrtc.latency.misses
         if misses:
             return DiagnosticStatus.WARN, f"{state}, {misses} deadline misses in a second"

@@ -180,6 +180,7 @@ class Recorder:
             [sensor.n_valid for sensor in layout.sensors],
             layout.fingerprint,
             math.ceil(_IN_FLIGHT * rate),
+            tip_tilt_sensors=layout.tip_tilt_sensors,
         )
         self._clock = ArrivalClock()
         self._node = Node("recorder", namespace=namespace or None, enable_rosout=False, start_parameter_services=False)

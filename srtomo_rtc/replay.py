@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from srtomo_core import wire
 from srtomo_core.bag import BagError, BagMessage, BagReader
@@ -27,6 +28,7 @@ from srtomo_rtc.vmm import KERNELS
 
 _TIMED = (Verdict.HOLD_INCOMPLETE, Verdict.HOLD_MISSING, Verdict.HOLD_BEHIND)
 _WINDOW = 400  # frames that the bag's order of messages may be off by
+_STARS = 4096  # frames of tip-tilt's own stars that are kept for commands that may have them in
 _SHOWN = 5  # differing frames that are kept for the report
 
 _Key = tuple[int, int]  # session, frame
@@ -91,6 +93,7 @@ class Replay:
         self.layout = Layout(self.system)
         self._reconstructors = {r.sha256: r for r in supplied or []}
         self._slots: dict[tuple[bytes, str], Slot] = {}
+        self.stars = _Stars(self.layout)
         self.events: list[Any] = []
         self.states: dict[_Key, Any] = {}
         self._read_everything_but_frames()
@@ -223,6 +226,7 @@ class Replay:
         answers: dict[_Key, wire.DmCommand] = {}
         newest: dict[int, int] = {}
         sessions: dict[int, _Session] = {}
+        own = self.layout.tip_tilt_sensors
         for done, message in enumerate(self._reader.messages(slopes, commands)):
             if done % 4096 == 0:
                 progress(done / total)
@@ -232,6 +236,9 @@ class Replay:
                     # the loop dropped all others too
                     if slope_frame.fingerprint == self.layout.fingerprint and fits(slope_frame, starts):
                         key = slope_frame.session, slope_frame.frame
+                        if slope_frame.sensor in own:
+                            self.stars.put(slope_frame)
+                            continue
                         if key not in frames and key[0] in named:
                             frames[key] = Exposure(starts)
                             if key[0] not in sessions and len(frames) > _WINDOW:
@@ -255,6 +262,37 @@ class Replay:
         if outcome.compared == 0:
             raise BagError(f"{self._reader.path}: no frame could be compared. {' '.join(outcome.gaps)}".rstrip())
         return outcome
+
+
+class _Stars:
+    """Slopes of tip-tilt's own stars, by session, frame and sensor; the first that came, as in the loop."""
+
+    def __init__(self, layout: Layout) -> None:
+        self._layout = layout
+        self._frames: dict[_Key, dict[int, NDArray[np.float32]]] = {}
+
+    def put(self, message: wire.SlopeFrame) -> None:
+        """Keep a message of whole sensors."""
+        frame = self._frames.setdefault((message.session, message.frame), {})
+        taken = 0
+        for sensor in range(message.sensor, message.sensor + message.n_sensors):
+            n = self._layout.sensors[sensor].n_slopes
+            frame.setdefault(sensor, message.slopes[taken : taken + n])
+            taken += n
+        if len(self._frames) > _STARS:
+            del self._frames[next(iter(self._frames))]
+
+    def slopes(self, session: int, frame: int, sensors: int) -> NDArray[np.float32] | None:
+        """(n_slopes,) of which those of ``sensors`` (bit w) count; None: some are not in the bag."""
+        slopes = np.zeros(self._layout.n_slopes, np.float32)
+        came = self._frames.get((session, frame), {})
+        for sensor in self._layout.tip_tilt_sensors:
+            if sensors >> sensor & 1:
+                own = came.get(sensor)
+                if own is None or len(own) != self._layout.sensors[sensor].n_slopes:
+                    return None
+                slopes[self._layout.slopes_of(sensor)] = own
+        return slopes
 
 
 def _name(verdict: int) -> str:
@@ -441,10 +479,17 @@ class _Session:
                 int(state.consecutive_holds),
                 int(state.frames_closed),
                 exposures,
+                (int(state.tip_tilt_frame), np.asarray(state.tip_tilt, np.float32)),
             )
 
     def _answer(self, exposure: Exposure | None, command: wire.DmCommand) -> None:
         loop = self._loop
+        if stars := command.sensors & ~loop.all_sensors:
+            slopes = self._replay.stars.slopes(self._session, command.tip_tilt_frame, stars)
+            if slopes is None:
+                self._lose(f"Frame {command.tip_tilt_frame} of tip-tilt's own stars is not in the bag.")
+                return
+            loop.give_tip_tilt(command.tip_tilt_frame, stars, slopes)
         if command.verdict == Verdict.OPEN and command.sensors == 0:
             # the flat that a stopping HRTC leaves behind, or one that hears nothing, answers no slopes
             loop.flatten()
@@ -452,7 +497,8 @@ class _Session:
             loop.hold(Verdict(command.verdict))
         elif exposure is not None and exposure.arrived == loop.all_sensors:
             for sensor, own in enumerate(exposure.slopes):
-                loop.add(sensor, own)
+                if loop.all_sensors >> sensor & 1:
+                    loop.add(sensor, own)
             loop.answer(*exposure.mirror)
         elif command.verdict in list(Verdict) and command.verdict != Verdict.OK:
             loop.hold(Verdict(command.verdict))  # whatever the slopes were, they were not used
@@ -473,6 +519,8 @@ class _Session:
             what = f"verdict {_name(command.verdict)} recorded, {loop.verdict.name} now"
         elif command.reconstructor != identity:
             what = f"reconstructor {command.reconstructor:016x} recorded, {identity:016x} now"
+        elif command.tip_tilt_frame != loop.tip_tilt_frame:
+            what = f"tip-tilt of frame {command.tip_tilt_frame} recorded, of {loop.tip_tilt_frame} now"
         elif len(command.commands) != len(loop.command):
             what = f"{len(command.commands)} commands recorded, {len(loop.command)} now"
         else:

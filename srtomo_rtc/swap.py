@@ -25,7 +25,7 @@ from srtomo_core.reconstructor import Reconstructor, ReconstructorError, block_t
 from srtomo_core.system import System
 from srtomo_core.wire import ReconstructorBlock
 from srtomo_rtc.compression import LIMIT, error_to_noise, int16_to_noise
-from srtomo_rtc.loop import Matrices, Program, Settings, Slot
+from srtomo_rtc.loop import Matrices, Program, Settings, Slot, star_weights
 from srtomo_rtc.lowrank import Factors, factorise
 
 Floats = NDArray[np.float32]
@@ -147,10 +147,17 @@ def stability(mismatch: NDArray[np.float64]) -> float:
 
 
 def seen_low_orders(system: System, layout: Layout) -> tuple[bool, bool]:
-    """Whether some sensor sees overall tip-tilt; and focus, which one lenslet alone takes for a tilt."""
-    stars = [system.star_of(sensor) for sensor in system.sensors]
-    return any(star.tip_tilt == "seen" for star in stars), any(
-        star.focus == "seen" and place.n_valid > 1 for star, place in zip(stars, layout.sensors, strict=True)
+    """Whether some sensor sees overall tip-tilt; and focus, which one lenslet alone takes for a tilt.
+
+    Sensors of tip-tilt's own loop do not count: what they see is not the high orders'.
+    """
+    high_orders = [
+        (system.star_of(sensor), place)
+        for w, (sensor, place) in enumerate(zip(system.sensors, layout.sensors, strict=True))
+        if w not in layout.tip_tilt_sensors
+    ]
+    return any(star.tip_tilt == "seen" for star, _ in high_orders), any(
+        star.focus == "seen" and place.n_valid > 1 for star, place in high_orders
     )
 
 
@@ -199,6 +206,13 @@ def check(reconstructor: Reconstructor, layout: Layout, G_cal: Floats, tip_tilt:
             raise Refused(f"{name}: holds values that are not finite")
     if not (reconstructor.command_limit > 0).all():
         raise Refused("command_limit: expected every limit above 0")
+    if layout.tip_tilt_sensors:
+        for R, _ in (reconstructor.parts[0], reconstructor.parts[-1]):
+            _check_tip_tilt(R, layout, G_cal)
+        # from here on the high orders': their Q is of the slopes that their loop has
+        G_cal = G_cal.copy()
+        for w in layout.tip_tilt_sensors:
+            G_cal[layout.slopes_of(w)] = 0
     seen = [bool(G_cal[:, layout.commands_of(i)].any()) for i in range(len(layout.mirrors))]
     _check_probes(reconstructor, layout, seen)
 
@@ -226,6 +240,31 @@ def check(reconstructor: Reconstructor, layout: Layout, G_cal: Floats, tip_tilt:
         )
     unseen = tuple(mirror.name for mirror, some in zip(layout.mirrors, seen, strict=True) if not some)
     return Check(max(stabilities), (low, high), unseen)
+
+
+def _check_tip_tilt(R: Floats, layout: Layout, G_cal: Floats) -> None:
+    """What tip-tilt's own loop makes of each star's alone has the sign and scale that the star's weight says.
+
+    With that any of them can be lost: what the rest makes lies in between.
+
+    Raises:
+        Refused: with the star.
+    """
+    weights = star_weights(layout, R)
+    tilts = np.zeros((2, layout.n_slopes), np.float32)
+    for w in layout.tip_tilt_sensors:
+        place = layout.sensors[w]
+        c, s = math.cos(place.rotation), math.sin(place.rotation)
+        tilts[:, layout.slopes_of(w)] = np.kron([[c, -s], [s, c]], np.ones(place.n_valid))
+    for w in layout.tip_tilt_sensors:
+        own = layout.slopes_of(w)
+        seen = tilts[:, own] @ R[:, own].T @ G_cal.T
+        ratios = np.einsum("ij,ij->i", seen, tilts) / np.einsum("ij,ij->i", tilts, tilts) / max(weights[w], 1e-9)
+        if not (SCALE_LIMITS[0] <= ratios.min() and ratios.max() <= SCALE_LIMITS[1]):
+            raise Refused(
+                f"wrong sign or scale: of the tip-tilt that {layout.sensors[w].name} sees, {ratios.min():.3g} to "
+                f"{ratios.max():.3g} is corrected, expected {SCALE_LIMITS[0]:g} to {SCALE_LIMITS[1]:g}"
+            )
 
 
 def _check_probes(reconstructor: Reconstructor, layout: Layout, seen: list[bool]) -> None:

@@ -46,6 +46,7 @@ from srtomo_core.clock import ArrivalClock
 from srtomo_core.layout import Layout
 from srtomo_core.system import InstrumentError, System, load_system
 from srtomo_sim.course import Change, alters_turbulence, scheduled
+from srtomo_sim.mirror import OnMirror
 from srtomo_sim.plant import Plant
 from srtomo_sim.sky import prepare, strehl
 
@@ -137,22 +138,12 @@ class SimNode(Node):
         )
         self._plant = Plant(system, sky)
         self.session = secrets.randbits(63) | 1
-        sensors = self._layout.sensors
-        groups = [range(len(sensors))] if values["combined"] else [range(w, w + 1) for w in range(len(sensors))]
-        self._writers = [
-            wire.SlopeFrameWriter(
-                sensors[group[0]].name,
-                self.session,
-                self._layout.fingerprint,
-                group[0],
-                len(group),
-                sum(sensors[w].n_valid for w in group),
-            )
-            for group in groups
-        ]
+        own = self._layout.tip_tilt_sensors
+        self._writers = self._writers_of([w for w in range(len(self._layout.sensors)) if w not in own])
+        self._star_writers = self._writers_of(own)
         rate = system.loop.rate
         # one writer for each message of a frame: a reader then orders each sensor by itself
-        depth = wire.SLOPES.depth_at(rate * len(groups))
+        depth = wire.SLOPES.depth_at(rate * (len(self._writers) + len(self._star_writers)))
         self._publisher = self._hot_node.create_publisher(
             SlopeFrameMsg, wire.SLOPES.name, QoSProfile(**wire.SLOPES.qos(depth))
         )
@@ -178,6 +169,29 @@ class SimNode(Node):
         self._computer.start()
         self.create_service(Trigger, "sim/start", self._on_start)
         self.create_service(ChangeSky, "sim/change", self._on_change)
+
+    def _writers_of(self, sensors: Sequence[int]) -> list[tuple[slice, wire.SlopeFrameWriter]]:
+        """A writer for each message of a frame of these sensors, with its place in the slope vector."""
+        layout, groups = self._layout, list[list[int]]()
+        for w in sensors:
+            if self._values["combined"] and groups and groups[-1][-1] == w - 1:
+                groups[-1].append(w)
+            else:
+                groups.append([w])
+        return [
+            (
+                slice(int(layout.slope_start[group[0]]), int(layout.slope_start[group[-1] + 1])),
+                wire.SlopeFrameWriter(
+                    layout.sensors[group[0]].name,
+                    self.session,
+                    layout.fingerprint,
+                    group[0],
+                    len(group),
+                    sum(layout.sensors[w].n_valid for w in group),
+                ),
+            )
+            for group in groups
+        ]
 
     def _on_start(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         response.success = not self._start.is_set()
@@ -263,7 +277,7 @@ class SimNode(Node):
                 self._slipped += behind
             if self._stop.is_set():
                 return
-            self._publish(k, slopes, on.frame, on.before, on.fraction)
+            self._publish(k, slopes, on)
         self._sleep_until(time.monotonic() + 2 * period)
         self._drain(clock, start, period)
 
@@ -274,7 +288,7 @@ class SimNode(Node):
             slopes = self._plant.measure(k)
             on = self._plant.on_mirror(k)
             self._look(k)
-            self._publish(k, slopes, on.frame, on.before, on.fraction)
+            self._publish(k, slopes, on)
             end = time.monotonic() + _LOCKSTEP_TIMEOUT
             while not self._answered(k):
                 if self._stop.is_set():
@@ -319,13 +333,15 @@ class SimNode(Node):
             return None
         return command.frame
 
-    def _publish(self, frame: int, slopes: np.ndarray, on: int, before: int, fraction: float) -> None:
+    def _publish(self, frame: int, slopes: np.ndarray, on: OnMirror) -> None:
         stamp = time.time_ns()
-        first = 0
-        for writer in self._writers:
-            writer.values[:] = slopes[first : first + len(writer.values)]
-            first += len(writer.values)
-            self._publisher.publish(writer.write(stamp, frame, on, before, fraction))
+        if (stars := self._plant.tip_tilt(frame)) is not None:
+            for place, writer in self._star_writers:
+                writer.values[:] = stars[1][place]
+                self._publisher.publish(writer.write(stamp, stars[0], wire.MIRROR_UNKNOWN, wire.MIRROR_UNKNOWN, 1.0))
+        for place, writer in self._writers:
+            writer.values[:] = slopes[place]
+            self._publisher.publish(writer.write(stamp, frame, *on))
         self.frame = frame
 
     def _look(self, frame: int) -> None:

@@ -25,6 +25,9 @@ class Plant:
     ``y = s - G m + jitter + noise``, with m the commands on the mirrors averaged over the exposure. What is random in a
     frame depends on seed and frame alone, whatever the order or pace of the calls. Not safe for calls from several
     threads at once.
+
+    Stars of tip-tilt's own loop expose over several of these exposures: :meth:`tip_tilt`. Mean slopes are the mean
+    wavefront's; of what :meth:`measure` returns theirs are without noise, and no camera's.
     """
 
     def __init__(self, system: System, sky: Sky, seed: int | None = None) -> None:
@@ -56,6 +59,11 @@ class Plant:
         self._ready = sky.n_frames
         self._screens: Screens | None = None  # as long as there is something to catch up with
         self._late: set[int] = set()
+        self._own = np.zeros(sky.layout.n_slopes, bool)
+        for w in sky.layout.tip_tilt_sensors:
+            self._own[sky.layout.slopes_of(w)] = True
+        self._exposing: dict[int, NDArray[np.float32]] = {}  # what their light has said so far, by exposure
+        self._exposed: dict[int, NDArray[np.float32]] = {}  # their frames that are over and not read
 
     def truth(self, frame: int) -> System:
         """The instrument as it is in the middle of an exposure: its sky, its light and where its sensors are."""
@@ -93,6 +101,8 @@ class Plant:
         slopes *= noise.sigma
         for own, factor in self._measured:
             slopes[own] = factor @ white[own]
+        own_noise = np.where(self._own, slopes, 0)
+        slopes -= own_noise
         slopes += sky.turbulence(frame)
         slopes -= place.interaction @ self._line.shape(frame)
         for i, layout in enumerate(place.layout.sensors):
@@ -101,10 +111,34 @@ class Plant:
             mine = slopes[sky.layout.slopes_of(i)]
             mine[: layout.n_valid] += c * tilt[0] + s * tilt[1]
             mine[layout.n_valid :] += c * tilt[1] - s * tilt[0]
+        self._expose(frame, slopes, own_noise)
         if self._line.is_late(frame):
             self._late.add(frame)
         self._now = max(self._now, frame + 1)
         return slopes
+
+    def _expose(self, frame: int, slopes: NDArray[np.float32], noise: NDArray[np.float32]) -> None:
+        """One exposure more for the stars of tip-tilt's own loop; they are read out, with noise, after the last."""
+        n = self._sky.system.loop.tip_tilt_frames
+        if not self._own.any():
+            return
+        self._exposing[frame] = slopes
+        if frame % n == n - 1:
+            parts = [self._exposing.pop(k, None) for k in range(frame + 1 - n, frame + 1)]
+            whole = [part for part in parts if part is not None]
+            if len(whole) == n:
+                self._exposed[frame // n] = np.mean(whole, axis=0, dtype=np.float32) + noise
+
+    def tip_tilt(self, frame: int) -> tuple[int, NDArray[np.float32]] | None:
+        """What stars of tip-tilt's own loop send just before the slopes of an exposure just measured.
+
+        Returns:
+            Their frame, and (n_slopes,) rad of which those of their sensors count; None: nothing is due.
+        """
+        loop = self._sky.system.loop
+        own, rest = divmod(frame + 1 - loop.tip_tilt_wait, loop.tip_tilt_frames)
+        slopes = self._exposed.pop(own - 1, None) if rest == 0 else None
+        return None if slopes is None else (own - 1, slopes)
 
     def change(self, change: Change) -> bool:
         """Change sky, light or sensors from an exposure on that has not been measured.

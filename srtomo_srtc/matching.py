@@ -111,7 +111,12 @@ class Matcher:
 
         Args:
             wanted: frames to put together; slopes of others are not looked at.
+
+        Raises:
+            ValueError: tip-tilt has a loop of its own, whose stars' slopes are not of these frames.
         """
+        if layout.tip_tilt_sensors:
+            raise ValueError("loop.tip_tilt: telemetry of such an instrument is not put together, nor learned from")
         self.tally = Tally()
         self._wanted = wanted
         self._fingerprint = layout.fingerprint

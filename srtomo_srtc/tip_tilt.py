@@ -8,8 +8,8 @@ tip and tilt on the lowest mirror. ``I - R_t G_t`` takes out of the high orders 
 stars see it in the sky too, and answer for it. ``R_t G_t A = A``: that loop's gain is what it says.
 
 Q counts the slopes of the high orders' sensors alone. It acts on all that is on the mirrors, tip-tilt's command t
-included: ``y_h + G_h m~`` is the open loop's whatever t was, and what is left of t in it would be what blind stars see
-of it, next to nothing.
+included: ``y_h + G_h m~`` is the open loop's whatever t was. Without t, what blind stars do see of it, the mirror's
+ripple on a tilt, would be answered for.
 
 With mirrors at several altitudes this loop controls tip-tilt and no plate scale: what lasers do not see of that is left
 to the prior.

@@ -79,6 +79,8 @@ def main(options: argparse.Namespace) -> int:
         "wfe_nm": 1e9 * mean_wfe(budgets),
     }
     _print_budgets(system, content)
+    if system.tip_tilt_sensors:
+        print("  tip-tilt as if its own loop's stars were read out in every frame; srtomo simulate has its true rate")
     if options.stability:
         content["stability"] = _stability(system, reconstructor)
     if end is not None:

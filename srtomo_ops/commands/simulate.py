@@ -62,7 +62,7 @@ def main(options: argparse.Namespace) -> int:
         sky = prepare(system, options.frames, options.seed, changes=changes, progress=progress.share)
     parts = reconstructor.parts if options.kernel == "tlr" else []
     factors = [factorise(system, sky.layout, R) for R, _ in parts]
-    settings = plain_settings(sky.layout, system.loop.leak)
+    settings = plain_settings(sky.layout, system.loop.leak, system.loop.tip_tilt)
     program = program_of(sky.layout, reconstructor, settings, options.kernel, factors)
     with Progress("loop") as progress:
         result = run(

@@ -1,10 +1,9 @@
 /* The frame path: serialised slopes in, serialised commands out. No allocation once made, no lock, no interpreter.
  *
- * law.c holds the control law, crew.c the threads that share its
- * products, lowrank.c some of these, gate.c the frame gate around it, ring.c what
- * both leave for the recorder; ros.c drives them from rcl. What they do is described where Python wraps them:
- * srtomo_rtc/loop.py, crew.py and hrtc.py. Structures that Python reads are mirrored in srtomo_rtc/native.py, which
- * compares srt_abi() with its own sum.
+ * law.c holds the control law, tiptilt.c that of tip-tilt's own loop, crew.c the threads that share their products,
+ * lowrank.c some of these, gate.c the frame gate around it, ring.c what both leave for the recorder; ros.c drives them
+ * from rcl. What they do is described where Python wraps them: srtomo_rtc/loop.py, crew.py and hrtc.py. Structures that
+ * Python reads are mirrored in srtomo_rtc/native.py, which compares srt_abi() with its own sum.
  *
  * Threads: one thread, the loop's, calls everything here but srt_loop_post, srt_loop_request, srt_gate_want_snapshot and
  * the srt_*_next functions, which are for one other thread at a time (or several under the interpreter's lock).
@@ -27,6 +26,9 @@ enum {
     SRT_ROWS = SRT_AHEAD + SRT_MAX_EPOCHS, /* exposures whose slopes are held: those to come and those that were */
     SRT_MAX_SENSORS = 32,
 };
+
+/* What became of a message. */
+enum srt_put { SRT_PUT, SRT_DUPLICATE, SRT_LATE, SRT_STRAY };
 
 /* msgs_schema/msg/DmCommand's constants */
 enum srt_verdict {
@@ -59,6 +61,13 @@ typedef struct {
     const float *Q;
 } srt_matrices;
 
+/* Of tip-tilt's own loop. */
+typedef struct {
+    float gain, keep;
+    float weight[SRT_MAX_SENSORS]; /* of a star in the mean over stars that R_t takes; they sum to 1 */
+    const float *reference;        /* (n_slopes) y_ref in R's order */
+} srt_tip_tilt_law;
+
 /* All that a command is made with. Immutable; vectors have n_rows values (a multiple of the tiles), those beyond the commands zero. */
 typedef struct {
     uint64_t token;          /* names it in what the loop tells; not 0 */
@@ -76,7 +85,29 @@ typedef struct {
     const float *reference, *alone_reference; /* R y_ref: of all epochs, and of the fallback */
     const srt_matrices *epochs;               /* (n_epochs), the newest exposure first */
     const srt_matrices *alone;                /* for the newest exposure alone */
+    srt_tip_tilt_law tip_tilt;                /* its R_t is the columns of `alone` */
 } srt_program;
+
+/* Tip-tilt's loop of its own, for others to look at. */
+typedef struct {
+    uint32_t sensors;   /* on stars of its own, which count their own frames; 0: there is no such loop */
+    uint32_t used;      /* those whose slopes came into it with the last answer */
+    int64_t frame;      /* the newest of their frames in it; -1: none */
+    uint64_t frames, partial, held, skipped; /* as in msgs_schema/msg/HrtcStatus */
+    float *command;     /* (n_rows) t */
+} srt_tip_tilt;
+
+/* The rest of it: tiptilt.c. */
+typedef struct {
+    int64_t given;      /* frame that the next answer is to use; -1: none */
+    int64_t coming;     /* frame that is being put together; -1: none yet */
+    int64_t jumped_to;
+    uint32_t given_sensors;
+    uint32_t arrived, finite, expected; /* of the coming frame: here; here and finite; without which it is waited */
+    bool over;                          /* the coming frame was given: what comes of it now comes too late */
+    float *given_slopes, *coming_slopes; /* (n_slopes) in R's order */
+    float *base, *trial, *product;       /* (n_rows) each; base is offset + t */
+} srt_stars;
 
 /* What was on the mirror during an exposure, as in SlopeFrame. */
 typedef struct {
@@ -101,11 +132,13 @@ typedef struct {
     atomic_int requested;      /* srt_loop_state */
     uint32_t n_sensors, n_commands, n_rows, n_slopes, max_epochs;
     float *command, *state, *history; /* (n_rows), (n_rows), (SRT_HISTORY, n_rows) */
+    srt_tip_tilt tip_tilt;
 
     /* the loop's own; what stands before is mirrored */
     _Atomic(const srt_program *) posted;
     srt_crew *crew; /* that shares the products; NULL: the loop's thread alone */
     const srt_program *program;
+    srt_stars stars;
     const srt_matrices *matrices; /* of the next frame: the newest epoch's, or the fallback's */
     bool several;                 /* earlier exposures are in the next command */
     bool leaps;                   /* the answer heeds no slew limit */
@@ -122,9 +155,9 @@ typedef struct {
     float *flat, *on_mirror, *q, *product, *older, *prepared, *trial; /* (n_rows) each */
 } srt_loop;
 
-/* NULL: no memory, or n_sensors above SRT_MAX_SENSORS. */
+/* NULL: no memory, or n_sensors above SRT_MAX_SENSORS. tip_tilt_sensors: bit w set: w is in tip-tilt's own loop. */
 srt_loop *srt_loop_new(const uint32_t *n_subapertures, uint32_t n_sensors, uint32_t n_commands, float delay,
-                       uint32_t max_epochs);
+                       uint32_t max_epochs, uint32_t tip_tilt_sensors);
 void srt_loop_free(srt_loop *loop);
 /* Share products with a crew, or NULL: with none. While the loop's thread does not run. */
 void srt_loop_use(srt_loop *loop, srt_crew *crew);
@@ -153,14 +186,37 @@ static inline int srt_loop_state_of(const srt_loop *loop)
     return loop->closed ? SRT_CLOSED : loop->held_flat ? SRT_FLAT : SRT_RELAXES;
 }
 
+/* Of all commands of a frame (n_rows). */
+double srt_loop_rms(const srt_loop *loop, const float *commands);
+
+/* total += R_w y for a whole sensor's slopes (in R's order); product: (n_rows) to compute in. */
+void srt_loop_add_product(const srt_loop *loop, const srt_matrices *matrices, uint32_t sensor, const float *slopes,
+                          float *product, float *total);
+
 /* Where a sensor's slopes of a frame stand, in R's order. */
 static inline float *srt_loop_slopes(const srt_loop *loop, int64_t frame, uint32_t sensor)
 {
     return loop->slopes + (size_t)(frame % SRT_ROWS) * loop->n_slopes + loop->first_slope[sensor];
 }
 
+/* Zeros, aligned as the products want them; NULL: no memory. */
+float *srt_floats(size_t n);
+
 /* x0 x1 .. y0 y1 .. (anywhere in memory) to x0 y0 x1 y1 .. */
 void srt_interleave(const void *xy, size_t n, float *out);
+
+/* -- tiptilt.c ---------------------------------------------------------------------------------------------------- */
+
+bool srt_tip_tilt_new(srt_loop *loop, uint32_t sensors);
+void srt_tip_tilt_free(srt_loop *loop);
+void srt_tip_tilt_start(srt_loop *loop);
+/* Whole adjacent sensors of a frame of the stars' own count, sensor by sensor, x then y, anywhere in memory. */
+enum srt_put srt_tip_tilt_put(srt_loop *loop, int64_t frame, uint32_t first, uint32_t n, const void *slopes);
+/* Have the next answer use a frame. slopes: (n_slopes) sensor by sensor, x then y; those of `sensors` count. */
+void srt_tip_tilt_give(srt_loop *loop, int64_t frame, uint32_t sensors, const float *slopes);
+/* In every answer, once the program is known: take the given frame in. What is on the mirror beside the state,
+ * (n_rows): offset + t. */
+const float *srt_tip_tilt_answer(srt_loop *loop);
 
 /* -- ring.c ------------------------------------------------------------------------------------------------------- */
 
@@ -220,6 +276,8 @@ typedef struct {
     uint32_t consecutive_holds, frames_closed;
     int32_t loop_state;
     float *state, *history; /* (n_rows), (SRT_HISTORY, n_rows) in the loop's order */
+    int64_t tip_tilt_frame;
+    float *tip_tilt;        /* (n_rows) */
 } srt_snapshot;
 
 /* Not 0: the message did not go out. */
@@ -228,7 +286,7 @@ typedef int (*srt_publish)(void *context, const uint8_t *message, size_t size);
 typedef struct {
     srt_loop *loop;
     uint64_t session;
-    int64_t last_slopes_ns;
+    int64_t last_slopes_ns, last_tip_tilt_ns;
     srt_counters counters;
     srt_latency latency;       /* last slopes received to command published */
     srt_latency frame_latency; /* first slopes received to command published */
@@ -241,11 +299,12 @@ typedef struct {
 } srt_gate;
 
 srt_gate *srt_gate_new(const uint32_t *n_subapertures, uint32_t n_sensors, uint32_t n_commands, float delay,
-                       uint32_t max_epochs, const uint8_t fingerprint[32], int64_t deadline_ns, int64_t max_behind);
+                       uint32_t max_epochs, uint32_t tip_tilt_sensors, const uint8_t fingerprint[32],
+                       int64_t deadline_ns, int64_t max_behind);
 void srt_gate_free(srt_gate *gate);
 void srt_gate_start(srt_gate *gate);
-/* The frame of a message that fits the instrument, used or not; -1: it does not. now_ns: when it was received. The message
- * stays as it is until the next call of this or of srt_gate_advance has returned. */
+/* The frame of a message that fits the instrument, used or not; -1: it does not, or is of stars that count their own.
+ * now_ns: when it was received. The message stays as it is until the next call of this or of srt_gate_advance has returned. */
 int64_t srt_gate_offer(srt_gate *gate, const uint8_t *message, size_t size, int64_t now_ns);
 void srt_gate_advance(srt_gate *gate);
 void srt_gate_idle(srt_gate *gate, int64_t now_ns);

@@ -90,7 +90,7 @@ int64_t srt_received(int64_t stamp_ns, int64_t looked_ns)
 enum {
     HEADER = 16,         /* encapsulation, stamp, length of frame_id */
     SLOPES_BODY = 80,    /* session .. number of slopes */
-    COMMAND_BODY = 68,   /* session .. number of commands */
+    COMMAND_BODY = 76,   /* session .. number of commands */
 };
 
 #define FRAME_ID "dm"
@@ -151,12 +151,14 @@ static void clear(const gate *g, exposure *e)
 }
 
 srt_gate *srt_gate_new(const uint32_t *n_subapertures, uint32_t n_sensors, uint32_t n_commands, float delay,
-                       uint32_t max_epochs, const uint8_t fingerprint[32], int64_t deadline_ns, int64_t max_behind)
+                       uint32_t max_epochs, uint32_t tip_tilt_sensors, const uint8_t fingerprint[32],
+                       int64_t deadline_ns, int64_t max_behind)
 {
     gate *g = calloc(1, sizeof *g);
     if (!g)
         return NULL;
-    srt_loop *loop = g->shared.loop = srt_loop_new(n_subapertures, n_sensors, n_commands, delay, max_epochs);
+    srt_loop *loop = srt_loop_new(n_subapertures, n_sensors, n_commands, delay, max_epochs, tip_tilt_sensors);
+    g->shared.loop = loop;
     if (!loop)
         goto no_memory;
     memcpy(g->fingerprint, fingerprint, sizeof g->fingerprint);
@@ -175,7 +177,8 @@ srt_gate *srt_gate_new(const uint32_t *n_subapertures, uint32_t n_sensors, uint3
     }
     for (int i = 0; i < SNAPSHOTS; i++)
         if (!(g->snapshots[i].state = malloc(loop->n_rows * sizeof(float))) ||
-            !(g->snapshots[i].history = malloc((size_t)SRT_HISTORY * loop->n_rows * sizeof(float))))
+            !(g->snapshots[i].history = malloc((size_t)SRT_HISTORY * loop->n_rows * sizeof(float))) ||
+            !(g->snapshots[i].tip_tilt = malloc(loop->n_rows * sizeof(float))))
             goto no_memory;
     g->body = body_start(sizeof FRAME_ID);
     g->command_size = g->body + COMMAND_BODY + 4 * (size_t)n_commands;
@@ -200,6 +203,7 @@ void srt_gate_free(srt_gate *shared)
     for (int i = 0; i < SNAPSHOTS; i++) {
         free(g->snapshots[i].state);
         free(g->snapshots[i].history);
+        free(g->snapshots[i].tip_tilt);
     }
     free(g->command);
     srt_loop_free(g->shared.loop);
@@ -257,6 +261,8 @@ static void snapshot(gate *g, int32_t sec, uint32_t nanosec)
     s->loop_state = srt_loop_state_of(loop);
     memcpy(s->state, loop->state, loop->n_rows * sizeof(float));
     memcpy(s->history, loop->history, (size_t)SRT_HISTORY * loop->n_rows * sizeof(float));
+    s->tip_tilt_frame = loop->tip_tilt.frame;
+    memcpy(s->tip_tilt, loop->tip_tilt.command, loop->n_rows * sizeof(float));
     atomic_store_explicit(&g->snapshots_in, in + 1, memory_order_release);
 }
 
@@ -344,6 +350,7 @@ static size_t write_command(gate *g, const exposure *e, int64_t frame, const srt
     PUT(place, uint8_t, (uint8_t)srt_loop_state_of(loop));
     PUT(place, uint16_t, (uint16_t)(loop->n_clipped < 65535 ? loop->n_clipped : 65535));
     PUT(place, float, program ? loop->gain : 0.0f);
+    PUT(place, int64_t, loop->tip_tilt.frame);
     PUT(place, int64_t, loop->mirror_frame);
     PUT(place, int64_t, loop->mirror_frame_before);
     PUT(place, float, loop->mirror_fraction);
@@ -549,6 +556,36 @@ static void place(gate *g, const slope_frame *s, int64_t now_ns)
         multiply(g, e);
 }
 
+/* A message of stars that count their own frames. */
+static void offer_stars(gate *g, const slope_frame *s, int64_t now_ns)
+{
+    srt_counters *counters = &g->shared.counters;
+    uint32_t sensors = (uint32_t)(((1ull << s->n_sensors) - 1) << s->sensor);
+    bool whole = s->first == 0 && s->n == g->start[s->sensor + s->n_sensors] - g->start[s->sensor];
+    if (!whole || sensors & g->shared.loop->all_sensors) {
+        counters->dropped_malformed++;
+        return;
+    }
+    if (g->fresh || s->session != g->shared.session) {
+        counters->dropped_session++;
+        return;
+    }
+    switch (srt_tip_tilt_put(g->shared.loop, (int64_t)s->frame, s->sensor, s->n_sensors, s->slopes)) {
+    case SRT_PUT:
+        g->shared.last_tip_tilt_ns = now_ns;
+        break;
+    case SRT_DUPLICATE:
+        counters->dropped_duplicate++;
+        break;
+    case SRT_LATE:
+        counters->dropped_late++;
+        break;
+    case SRT_STRAY:
+        counters->dropped_session++;
+        break;
+    }
+}
+
 int64_t srt_gate_offer(srt_gate *shared, const uint8_t *message, size_t size, int64_t now_ns)
 {
     gate *g = (gate *)shared;
@@ -569,6 +606,10 @@ int64_t srt_gate_offer(srt_gate *shared, const uint8_t *message, size_t size, in
     }
     if (!fits(g, &s)) {
         counters->dropped_malformed++;
+        return -1;
+    }
+    if ((((1ull << s.n_sensors) - 1) << s.sensor) & loop->tip_tilt.sensors) {
+        offer_stars(g, &s, now_ns);
         return -1;
     }
     int64_t frame = (int64_t)s.frame, ahead = frame - loop->frame;
@@ -639,7 +680,7 @@ int srt_gate_not_flat(const srt_gate *shared)
     const srt_loop *loop = shared->loop;
     bool shown = loop->closed;
     for (uint32_t i = 0; i < loop->n_commands; i++)
-        shown = shown || loop->state[i] != 0;
+        shown = shown || loop->state[i] != 0 || loop->tip_tilt.command[i] != 0;
     return shared->session && shown;
 }
 

@@ -7,7 +7,7 @@
 #include "crew.h"
 #include "kernel.h"
 
-static float *floats(size_t n)
+float *srt_floats(size_t n)
 {
     size_t bytes = (n * sizeof(float) + 63) / 64 * 64;
     float *made = aligned_alloc(64, bytes ? bytes : 64);
@@ -29,7 +29,7 @@ static void copy(float *to, const float *from, size_t n)
 static void expect_in_time(srt_loop *loop);
 
 srt_loop *srt_loop_new(const uint32_t *n_subapertures, uint32_t n_sensors, uint32_t n_commands, float delay,
-                       uint32_t max_epochs)
+                       uint32_t max_epochs, uint32_t tip_tilt_sensors)
 {
     if (n_sensors > SRT_MAX_SENSORS || max_epochs < 1 || max_epochs > SRT_MAX_EPOCHS)
         return NULL;
@@ -37,7 +37,7 @@ srt_loop *srt_loop_new(const uint32_t *n_subapertures, uint32_t n_sensors, uint3
     if (!loop)
         return NULL;
     loop->n_sensors = n_sensors;
-    loop->all_sensors = (uint32_t)((1ull << n_sensors) - 1);
+    loop->all_sensors = (uint32_t)((1ull << n_sensors) - 1) & ~tip_tilt_sensors;
     loop->n_commands = n_commands;
     loop->n_rows = (n_commands + SRT_TILE_INT16 - 1) / SRT_TILE_INT16 * SRT_TILE_INT16;
     loop->max_epochs = max_epochs;
@@ -51,10 +51,11 @@ srt_loop *srt_loop_new(const uint32_t *n_subapertures, uint32_t n_sensors, uint3
     size_t m = loop->n_rows;
     float **vectors[] = {&loop->command, &loop->state, &loop->flat, &loop->on_mirror, &loop->q,
                          &loop->product, &loop->older, &loop->prepared, &loop->trial};
-    bool complete = (loop->history = floats(SRT_HISTORY * m)) && (loop->sums = floats(n_sensors * m)) &&
-                    (loop->slopes = floats((size_t)SRT_ROWS * loop->n_slopes));
+    bool complete = (loop->history = srt_floats(SRT_HISTORY * m)) && (loop->sums = srt_floats(n_sensors * m)) &&
+                    (loop->slopes = srt_floats((size_t)SRT_ROWS * loop->n_slopes));
     for (size_t i = 0; i < sizeof vectors / sizeof *vectors; i++)
-        complete = (*vectors[i] = floats(m)) && complete;
+        complete = (*vectors[i] = srt_floats(m)) && complete;
+    complete = srt_tip_tilt_new(loop, tip_tilt_sensors) && complete;
     if (!complete) {
         srt_loop_free(loop);
         return NULL;
@@ -71,6 +72,7 @@ void srt_loop_free(srt_loop *loop)
                       loop->older,   loop->prepared, loop->trial, loop->history,   loop->sums, loop->slopes};
     for (size_t i = 0; i < sizeof owned / sizeof *owned; i++)
         free(owned[i]);
+    srt_tip_tilt_free(loop);
     free(loop);
 }
 
@@ -141,6 +143,7 @@ void srt_loop_start(srt_loop *loop, int64_t frame, int state)
     zero(loop->state, loop->n_rows);
     zero(loop->history, (size_t)SRT_HISTORY * loop->n_rows);
     srt_loop_forget(loop);
+    srt_tip_tilt_start(loop);
     loop->several = false;
     no_sensor_came(loop);
     expect_in_time(loop);
@@ -204,7 +207,15 @@ static void add_scaled(const srt_loop *loop, const srt_matrices *matrices, uint3
             total[i] += sums[i];
 }
 
-/* out = Q u~ with the state that was on the mirror. */
+void srt_loop_add_product(const srt_loop *loop, const srt_matrices *matrices, uint32_t sensor, const float *slopes,
+                          float *product, float *total)
+{
+    zero(product, loop->n_rows);
+    accumulate(loop, matrices, sensor, 0, 2 * (size_t)loop->n_subapertures[sensor], slopes, product);
+    add_scaled(loop, matrices, sensor, product, total);
+}
+
+/* out = Q u~ with the state that was on the mirror, and with what tip-tilt's own loop had put there. */
 static void multiply_mirror(srt_loop *loop, const float *Q, srt_mirror mirror, float *out)
 {
     size_t m = loop->n_rows;
@@ -239,12 +250,9 @@ static void form_older(srt_loop *loop)
     for (uint32_t j = 1; j < program->n_epochs; j++) {
         const srt_matrices *matrices = program->epochs + j;
         int64_t frame = loop->frame - j;
-        for (uint32_t w = 0; w < loop->n_sensors; w++) {
-            zero(loop->product, loop->n_rows);
-            accumulate(loop, matrices, w, 0, 2 * (size_t)loop->n_subapertures[w], srt_loop_slopes(loop, frame, w),
-                       loop->product);
-            add_scaled(loop, matrices, w, loop->product, loop->older);
-        }
+        for (uint32_t w = 0; w < loop->n_sensors; w++)
+            if (loop->all_sensors >> w & 1)
+                srt_loop_add_product(loop, matrices, w, srt_loop_slopes(loop, frame, w), loop->product, loop->older);
         if (program->polc) {
             multiply_mirror(loop, matrices->Q, loop->mirror[frame % SRT_ROWS], loop->product);
             for (size_t i = 0; i < loop->n_rows; i++)
@@ -334,19 +342,19 @@ void srt_loop_add(srt_loop *loop, uint32_t sensor, const float *slopes)
     srt_loop_multiply(loop, sensor, n);
 }
 
-static void relax(srt_loop *loop)
+static void relax(const srt_loop *loop, float *state)
 {
-    float share = loop->held_flat ? 0.0f : 1.0f - loop->program->relaxation, *state = loop->state;
+    float share = loop->held_flat ? 0.0f : 1.0f - loop->program->relaxation;
     for (size_t i = 0; i < loop->n_rows; i++) {
         float value = state[i] * share;
         state[i] = fabsf(value) < 1e-12f ? 0.0f : value; /* a picometre: do not decay into denormals */
     }
 }
 
-/* m = clip(u + o); as below, u = m - o where that changed anything. */
-static void clip(srt_loop *loop)
+/* m = clip(u + o + t); here and below offset is o + t, and u = m - o - t where that changed anything. */
+static void clip(srt_loop *loop, const float *offset)
 {
-    const float *offset = loop->program->offset, *limit = loop->program->limit;
+    const float *limit = loop->program->limit;
     float *restrict state = loop->state, *restrict command = loop->command;
     uint32_t clipped = 0;
     for (size_t i = 0; i < loop->n_rows; i++) {
@@ -360,26 +368,30 @@ static void clip(srt_loop *loop)
     loop->n_clipped = clipped;
 }
 
-/* The whole command smaller, in the same shape, where its rms is above the limit. */
-static void scale(srt_loop *loop)
+double srt_loop_rms(const srt_loop *loop, const float *commands)
 {
     enum { LANES = 8 }; /* n_rows is a multiple: a fixed order of summation on every machine */
+    double sums[LANES] = {0}, total = 0;
+    for (size_t i = 0; i < loop->n_rows; i += LANES)
+        for (int lane = 0; lane < LANES; lane++)
+            sums[lane] += (double)commands[i + lane] * commands[i + lane];
+    for (int lane = 0; lane < LANES; lane++)
+        total += sums[lane];
+    return sqrt(total / loop->n_commands);
+}
+
+/* The whole command smaller, in the same shape, where its rms is above the limit. */
+static void scale(srt_loop *loop, const float *offset)
+{
     float limit = loop->program->rms, *restrict command = loop->command;
     loop->scaled = 0;
     if (limit == INFINITY)
         return;
-    double sums[LANES] = {0}, total = 0;
-    for (size_t i = 0; i < loop->n_rows; i += LANES)
-        for (int lane = 0; lane < LANES; lane++)
-            sums[lane] += (double)command[i + lane] * command[i + lane];
-    for (int lane = 0; lane < LANES; lane++)
-        total += sums[lane];
-    double rms = sqrt(total / loop->n_commands);
+    double rms = srt_loop_rms(loop, command);
     if (rms <= limit * (1 + 1e-6)) /* what was scaled before is not scaled again for its rounding */
         return;
     loop->scaled = 1;
     float share = (float)(limit / rms), *restrict state = loop->state;
-    const float *offset = loop->program->offset;
     for (size_t i = 0; i < loop->n_rows; i++) {
         command[i] *= share;
         state[i] = command[i] - offset[i];
@@ -388,13 +400,13 @@ static void scale(srt_loop *loop)
 
 /* No command further from the last than the limit. It has the last word: from one command within all limits to another,
  * the rms may be above its own by as much as this limit. */
-static void slew(srt_loop *loop)
+static void slew(srt_loop *loop, const float *offset)
 {
     float limit = loop->program->slew, *restrict command = loop->command, *restrict state = loop->state;
     loop->n_slewed = 0;
     if (limit == INFINITY || loop->leaps)
         return;
-    const float *last = shown(loop, loop->frame - 1), *offset = loop->program->offset;
+    const float *last = shown(loop, loop->frame - 1);
     uint32_t slewed = 0;
     for (size_t i = 0; i < loop->n_rows; i++) {
         float wanted = command[i], low = last[i] - limit, high = last[i] + limit;
@@ -415,11 +427,14 @@ static int finish(srt_loop *loop, int verdict)
     else
         loop->consecutive_holds++;
     if (program) {
-        if (!loop->closed)
-            relax(loop);
-        clip(loop);
-        scale(loop);
-        slew(loop);
+        if (!loop->closed) {
+            relax(loop, loop->state);
+            relax(loop, loop->tip_tilt.command);
+        }
+        const float *offset = srt_tip_tilt_answer(loop);
+        clip(loop, offset);
+        scale(loop, offset);
+        slew(loop, offset);
         if (loop->closed && loop->consecutive_holds > program->fault_budget) {
             srt_loop_request(loop, SRT_RELAXES);
             loop->opened_by_faults++;
@@ -432,7 +447,7 @@ static int finish(srt_loop *loop, int verdict)
     keep(loop, frame, verdict == SRT_OK,
          (srt_mirror){loop->mirror_frame, loop->mirror_frame_before, loop->mirror_fraction});
     loop->verdict = verdict;
-    loop->used = loop->sensors;
+    loop->used = loop->sensors | loop->tip_tilt.used;
     loop->answered = frame;
     loop->frame = frame + 1;
     loop->sensors = 0;
@@ -468,7 +483,8 @@ int srt_loop_answer(srt_loop *loop, int64_t newest, int64_t before, float fracti
     const float *prepared = loop->prepared;
     zero(total, m);
     for (uint32_t w = 0; w < loop->n_sensors; w++)
-        add_scaled(loop, loop->matrices, w, loop->sums + (size_t)w * m, total);
+        if (loop->all_sensors >> w & 1)
+            add_scaled(loop, loop->matrices, w, loop->sums + (size_t)w * m, total);
     for (size_t i = 0; i < m; i++)
         trial[i] = prepared[i] + gain * total[i];
     if (!srt_all_finite(trial, m))
@@ -485,6 +501,8 @@ int srt_loop_hold(srt_loop *loop, int verdict)
 int srt_loop_flatten(srt_loop *loop)
 {
     zero(loop->state, loop->n_rows);
+    zero(loop->tip_tilt.command, loop->n_rows);
+    loop->stars.given = -1;
     loop->sensors = 0;
     loop->leaps = true;
     int verdict = finish(loop, SRT_OPEN);

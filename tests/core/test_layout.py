@@ -148,6 +148,7 @@ MATTERS = {
     "mirrors.0.coupling": 0.31,
     "mirrors.0.margin": 1.5,
     "mirrors.0.grid": "hexagonal",
+    "loop.tip_tilt": {"rate": 40.0, "gain": 0.5},
 }
 """What slopes and commands depend on, with another value."""
 

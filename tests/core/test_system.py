@@ -8,6 +8,7 @@ import pytest
 import yaml
 from pydantic import ValidationError
 
+from srtomo_core.layout import Layout
 from srtomo_core.system import InstrumentError, System, describe, load_system, system_names
 from srtomo_core.units import ARCSEC, parse
 
@@ -254,3 +255,34 @@ def test_changes_that_are_refused(key, value, expected):
 def test_elongation_needs_a_laser_a_place_and_a_thickness(changes, message):
     with pytest.raises(InstrumentError, match=message):
         load_system("mini", changes)
+
+
+@pytest.mark.parametrize(
+    ("own", "reason"),
+    [
+        ({"rate": "60 Hz"}, "loop.tip_tilt.rate: expected rate (200 Hz) over a whole number, got 60"),
+        ({"rate": "400 Hz"}, "loop.tip_tilt.rate: expected rate (200 Hz) over a whole number, got 400"),
+        ({"delay": "1.3 frames"}, "loop.tip_tilt.delay: expected 1.2 frames, or whole exposures"),
+        ({"delay": "1.1 frames"}, "loop.tip_tilt.delay: expected 1.2 frames, or whole exposures"),
+        ({"delay": "3 frames", "gain": 0.7}, "loop.tip_tilt.gain: not stable with a delay of 3 frames, got 0.7"),
+    ],
+)
+def test_tip_tilt_s_own_loop_is_refused(own, reason):
+    """Stable at a delay of n frames below a gain of 2 sin(pi / (4n - 2)): 0.618 at 3."""
+    with pytest.raises(InstrumentError) as error:
+        load_system("mini", {"loop.tip_tilt": {"rate": "40 Hz", "gain": 0.5, **own}})
+    assert reason in str(error.value) and "\n" not in str(error.value)
+
+
+def test_tip_tilt_s_own_loop():
+    mini = load_system("mini")
+    assert (mini.tip_tilt_sensors, mini.rate_of(mini.sensors[3])) == ((), 200)
+    system = mini.with_changes({"loop.tip_tilt": {"rate": "40 Hz", "delay": "1.6 frames", "gain": 0.5}})
+    assert (system.loop.tip_tilt_frames, system.loop.tip_tilt_wait) == (5, 2)
+    assert (system.tip_tilt_sensors, [system.rate_of(sensor) for sensor in system.sensors]) == ((3,), [200] * 3 + [40])
+    assert Layout(system).fingerprint != Layout(mini).fingerprint
+    assert (
+        mini.with_changes({"loop.tip_tilt": {"rate": 66.666667, "delay": 3.0, "gain": 0.617}}).loop.tip_tilt_frames == 3
+    )
+    with pytest.raises(InstrumentError, match=r"loop.tip_tilt: expected some sensors on stars that see tip-tilt"):
+        system.with_changes({"guide_stars.*.tip_tilt": "seen"})

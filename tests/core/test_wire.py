@@ -47,7 +47,7 @@ def test_slope_frames_that_others_write(
 
 
 @QUICK
-@given(NAME, U32, st.tuples(U64, U64, U64, U32, U32, U8, U8, U16, F32, I64, I64, F32, F32), FLOATS)
+@given(NAME, U32, st.tuples(U64, U64, U64, U32, U32, U8, U8, U16, F32, I64, I64, I64, F32, F32), FLOATS)
 def test_commands_that_others_write(name, nanosec, fields, commands):
     names = wire.DmCommand._fields[2:-1]
     buffer = encode(
@@ -97,7 +97,7 @@ def test_slope_frames_for_others(name):
 def test_commands_for_others():
     writer = wire.DmCommandWriter("dm", 7)
     writer.values[:] = np.arange(7) * 1e-8
-    fields = (1, 2, 3, 4, 5, 6, 1, 8, 0.5, -1, 9, 0.75, 1e-4)
+    fields = (1, 2, 3, 4, 5, 6, 1, 8, 0.5, 7, -1, 9, 0.75, 1e-4)
     message = decode(wire.COMMAND.type, writer.write(10, 20, *fields))
     names = wire.DmCommand._fields[2:-1]
     assert tuple(getattr(message, name) for name in names) == pytest.approx(fields)
@@ -124,7 +124,7 @@ def samples():
     block = wire.ReconstructorBlock(1, bytes(32), 0, 0, 0, 0, np.ones((2, 3), "f4"))
     return [
         (wire.read_slope_frame, slopes.write(0, 0, 0, 0, 1.0)),
-        (wire.read_dm_command, command.write(0, 0, *[0] * 13)),
+        (wire.read_dm_command, command.write(0, 0, *[0] * 14)),
         (wire.read_block, wire.write_block(block)),
     ]
 

@@ -312,7 +312,7 @@ def test_forged_commands(instrument):
     ):
         writer = wire.DmCommandWriter("forged", n)
         writer.values[:] = value
-        publisher.publish(writer.write(0, 0, session, frame + ahead, FORGED, 0, 15, 0, 1, 0, 0.5, -1, -1, 1.0, 0.0))
+        publisher.publish(writer.write(0, 0, session, frame + ahead, FORGED, 0, 15, 0, 1, 0, 0.5, -1, -1, -1, 1.0, 0.0))
     publisher.publish(NO_COMMAND)
     for reason in ("expected finite values", "expected shape", "exposures up to", "expected little-endian CDR"):
         instrument.plant.wait_for(reason)

@@ -172,7 +172,7 @@ def run(
         if fit is None:
             continue
         answers.values[:] = loop.command
-        fields = (7, frame, loop.program.slot.id, 1, 15, loop.verdict, loop.closed, loop.n_clipped, 0.5)
+        fields = (7, frame, loop.program.slot.id, 1, 15, loop.verdict, loop.closed, loop.n_clipped, 0.5, -1)
         mirror = loop.mirror_frame, loop.mirror_frame_before, loop.mirror_fraction
         telemetry.add_command(answers.write(0, frame, *fields, *mirror, 0.0))
         if (frame + 1) % round(window * rate) == 0:

@@ -90,7 +90,7 @@ def _run(system: System, sky: Sky, told: bool = True):
             yield True, writer.write(k, k, *mirror)
         loop.answer(*mirror)
         slot_id = loop.program.slot.id
-        fields = (7, k, slot_id, 1, 15, loop.verdict, loop.closed, loop.n_clipped, 0.5)
+        fields = (7, k, slot_id, 1, 15, loop.verdict, loop.closed, loop.n_clipped, 0.5, -1)
         answers.values[:] = loop.command
         yield False, answers.write(0, k, *fields, loop.mirror_frame, loop.mirror_frame_before, loop.mirror_fraction, 0)
         # due at k + 1.6, when the mirrors move; the loop can know of a late one only where it is told

@@ -56,7 +56,7 @@ class Instrument:
 
     def commands(self, *frames: int) -> None:
         for frame in frames:
-            fields = (SESSION, frame, 0, 0, 3, 0, 1, 0, 0.5, -1, -1, 1.0, 1e-4)
+            fields = (SESSION, frame, 0, 0, 3, 0, 1, 0, 0.5, -1, -1, -1, 1.0, 1e-4)
             self.ledger.add_command(self.command_writer.write(0, 0, *fields))
 
     def all(self, *frames: int) -> None:
@@ -202,7 +202,7 @@ def test_the_flat_that_a_stopping_hrtc_leaves_is_no_loss():
         instrument.slopes(0, frame)
         instrument.slopes(1, frame)
         instrument.commands(frame)
-    fields = (SESSION, 10, 0, 0, 0, 1, 0, 0, 0.5, -1, -1, 1.0, 1e-4)
+    fields = (SESSION, 10, 0, 0, 0, 1, 0, 0, 0.5, -1, -1, -1, 1.0, 1e-4)
     instrument.ledger.add_command(instrument.command_writer.write(0, 0, *fields))
     instrument.now += 1
     assert instrument.ledger.lost == (0, 0)

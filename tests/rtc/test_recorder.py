@@ -71,7 +71,7 @@ class Instrument:
             writer.values[:] = np.random.default_rng(frame).standard_normal(len(writer.values))
             sent.append(writer.write(time.time_ns(), frame, -1, -1, 1.0))
             self.slopes.publish(sent[-1])
-        fields = (SESSION, frame, 0, 0, 15, 0, 1, 0, 0.5, -1, -1, 1.0, 1e-4)
+        fields = (SESSION, frame, 0, 0, 15, 0, 1, 0, 0.5, -1, -1, -1, 1.0, 1e-4)
         self._command_writer.values[:] = frame
         sent.append(self._command_writer.write(0, 0, *fields))
         self.commands.publish(sent[-1])
