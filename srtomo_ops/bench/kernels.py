@@ -21,6 +21,7 @@ from srtomo_core.layout import Layout
 from srtomo_core.reconstructor import Reconstructor
 from srtomo_core.system import System
 from srtomo_ops.simulate import plain_settings
+from srtomo_rtc import realtime
 from srtomo_rtc.compression import LIMIT, SlopeStatistics, error_to_noise, int16_to_noise
 from srtomo_rtc.crew import Crew
 from srtomo_rtc.loop import Loop, Program, Slot, Verdict
@@ -102,9 +103,11 @@ def measure(
     threads: Sequence[int],
     frames: int,
     tolerances: Sequence[float] = TOLERANCES,
+    fifo_priority: int = 0,
     progress: Callable[[str, float], None] = lambda stage, done: None,
 ) -> list[Row]:
-    """Every kernel with every number of threads (1 first), ``frames`` frames each.
+    """Every kernel with every number of threads (1 first), ``frames`` frames each; under SCHED_FIFO, if asked for, from
+    when the factors are found.
 
     Raises:
         ValueError: the reconstructor is of another instrument or predictive, or a kernel does not do what it states.
@@ -120,6 +123,8 @@ def measure(
             runners[row.kernel] = [
                 _Runner(system, layout, slot, crew, one) for crew, one in zip(crews, rows, strict=True)
             ]
+        if not (outcome := realtime.fifo_priority(fifo_priority)).applied:
+            raise ValueError(str(outcome))
         slopes = list(1e-7 * np.random.default_rng(0).standard_normal((_TURN, layout.n_slopes)).astype(np.float32))
         done = -_TURN  # the first turn is for the caches
         while done < frames:

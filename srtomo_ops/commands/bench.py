@@ -61,7 +61,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     loop.add_argument("--pairs", type=int, default=10, help="of turns, HRTC and echo, of each arrival (default: 10)")
     loop.add_argument("--packets", type=int, default=4, help="a sensor and frame when staggered (default: 4)")
-    loop.add_argument("--fifo-priority", type=int, default=0, help="SCHED_FIFO of both nodes (default: 0, none)")
+    loop.add_argument("--fifo-priority", type=int, default=0, help="SCHED_FIFO (default: 0, none)")
     loop.add_argument("--compute-only", action="store_true", help="without processes, without ROS")
     loop.add_argument(
         "--reconstructor",
@@ -135,6 +135,7 @@ def _kernels(options: argparse.Namespace) -> int:
             Reconstructor.load(options.reconstructor),
             candidates(options.threads),
             options.frames,
+            fifo_priority=options.fifo_priority,
             progress=progress.stage,
         )
     print("\n".join([f"{system.name}, {options.frames} frames each, {instructions()}", *kernels.table(rows)]))
