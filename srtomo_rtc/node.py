@@ -312,7 +312,8 @@ class HrtcNode(LifecycleNode):
             choice = choose(swap.scratch(), tried, 1 / self._rate, others)
         self._crew = Crew(choice.threads, max(SPIN_NS, self._hot.poll_ns))
         self._hrtc.loop.use(self._crew)
-        detail = f"{KERNELS[kernel]}, {instructions()}, {choice.threads} threads ({'asked for' if threads else 'auto'})"
+        how = f"{choice.threads} thread{'s' * (choice.threads > 1)} ({'asked for' if threads else 'auto'})"
+        detail = f"{KERNELS[kernel]}, {instructions()}, {how}"
         outcome = realtime.Outcome("kernel", True, f"{detail}; measured: {', '.join(map(str, choice.timings))}")
         self.get_logger().info(str(outcome))
         return outcome
@@ -336,6 +337,7 @@ class HrtcNode(LifecycleNode):
     def _load(self, path: str) -> None:
         assert self._swap is not None
         held = self._swap.stage_whole(Reconstructor.load(path))
+        self.get_logger().info(f"{Path(path).name}: {held.check}")
         program = self._swap.commit(held.slot.id, held.slot.sha256)
         self._kinds[id(program)] = (EventKind.COMMIT, f"{held.label} from {Path(path).name}")
 

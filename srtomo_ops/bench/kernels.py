@@ -32,6 +32,7 @@ TOLERANCES = (0.3, 0.09, 0.03, 0.01)
 
 _TURN = 10  # frames
 _DRAWN = 24  # slope vectors that the stated error is held against
+_ALIKE = 0.5  # of the stated error: so few vectors tell no better
 _UNKNOWN = -(2**63)  # of SlopeFrame: as if the last command was in time
 
 
@@ -182,6 +183,8 @@ def _slots(
             raise ValueError(f"{kernel}: a product is not that of the matrix that is stated")
         wrong = products - drawn.astype(np.float64) @ R.T.astype(np.float64)
         rms = math.sqrt(float(np.sum(wrong**2)) / len(drawn)) / noise
+        if not abs(rms - error) <= _ALIKE * error + 1e-4:
+            raise ValueError(f"{kernel}: slopes drawn at random leave {rms:.2g} where {error:.2g} is stated")
         return Row(kernel, 1, nbytes, rank, whole, error, rms, [])
 
     for kernel, error, nbytes in (

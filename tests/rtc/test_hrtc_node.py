@@ -504,7 +504,7 @@ def test_round_and_round_the_lifecycle(ros, others):
     wait_until(operator, lambda: operator.hrtc is not None and operator.hrtc.state == "inactive")
     realtime = operator.hrtc.realtime
     assert realtime.count("SCHED_FIFO") == 1
-    assert f"{instructions()}, {CREW} threads (asked for); measured: float32 with {CREW} thread" in realtime
+    assert f"{instructions()}, {CREW} thread{'s' * (CREW > 1)} (asked for); measured: float32 with" in realtime
     assert "int16 with" in realtime and realtime.count("affinity of the helpers cores") == (CREW > 1)
     assert helpers_of(process) == CREW - 1
     assert process.terminate() == 0, process.output  # inactive
