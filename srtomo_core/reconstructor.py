@@ -30,6 +30,7 @@ Floats = NDArray[np.float32]
 _FORMAT = "srtomo-reconstructor-1"
 _ROWS_PER_BLOCK = 64
 _PROBES = 4
+_ROWS_AT_ONCE = 512
 
 
 class ReconstructorError(ValueError):
@@ -43,9 +44,10 @@ def _frozen(values: ArrayLike) -> Floats:
 
 
 def _product(R: Floats, G: NDArray[np.float64], threads: int) -> NDArray[np.float64]:
-    """R G in float64, a stretch of rows on each thread."""
+    """R G in float64, stretches of rows on each thread: R is never whole in float64."""
+    pieces = threads * max(1, len(R) // (threads * _ROWS_AT_ONCE))
     with ThreadPoolExecutor(threads) as pool:
-        parts = pool.map(lambda rows: rows.astype(np.float64) @ G, np.array_split(R, threads))
+        parts = pool.map(lambda rows: rows.astype(np.float64) @ G, np.array_split(R, pieces))
         return np.concatenate(list(parts))
 
 

@@ -30,6 +30,7 @@ Array = NDArray[np.float64]
 
 _PLATE_SCALE_STARS = 3
 _POINTS_PER_PITCH = 2
+_COPIES = 3  # of influence functions, in a fit to shapes
 _NEGLIGIBLE = 1e-3  # of the largest singular value, in fits of shapes and in what stars see of them
 
 
@@ -70,6 +71,14 @@ class Split:
         commands = low_order_commands(system, layout)
         answer = commands @ np.linalg.pinv(measured @ (G @ commands), rcond=_NEGLIGIBLE)
         return cls(np.flatnonzero(~sees), np.flatnonzero(sees), measured, answer, answer @ (measured @ G))
+
+
+def bytes_needed(system: System, layout: Layout) -> float:
+    """Memory of :meth:`Split.of` at its peak, about: the largest mirror's functions on all that is seen of it."""
+    return max(
+        _COPIES * 8.0 * place.n_actuators * len(_seen_points(system, layout, m)[0])
+        for m, place in enumerate(layout.mirrors)
+    )
 
 
 def low_order_commands(system: System, layout: Layout) -> Array:
@@ -129,11 +138,14 @@ def _shapes(system: System, layout: Layout, mirror: int) -> Array:
 
 
 def _seen_points(system: System, layout: Layout, mirror: int) -> tuple[Array, Array]:
-    """Points of a mirror's conjugate plane that some star or science target is seen through, m."""
+    """Points of a mirror's conjugate plane that some star or science target is seen through, one a grid's cell; m."""
     place = layout.mirrors[mirror]
     grid = pupil_grid(system.telescope, place.pitch / _POINTS_PER_PITCH)
     heights = np.array([place.altitude])
     sights = [(star.position, system.los_range(star)) for star in map(system.star_of, system.sensors)]
     sights += [(target.position, math.inf) for target in system.science.targets]
     seen = [footprints(grid.x, grid.y, position, distance, heights) for position, distance in sights]
-    return np.concatenate([p.x[0] for p in seen]), np.concatenate([p.y[0] for p in seen])
+    x, y = (np.concatenate([getattr(p, axis)[0] for p in seen]) for axis in "xy")
+    cells = np.floor(np.stack([x, y]) * (_POINTS_PER_PITCH / place.pitch))
+    first = np.unique(cells, axis=1, return_index=True)[1]
+    return x[first], y[first]

@@ -26,8 +26,8 @@ from srtomo_srtc.mirrors import interaction_matrix
 from srtomo_srtc.model import blind_modes, layout_of, project
 from srtomo_srtc.provenance import Stages, reconstructor_of
 from srtomo_srtc.reconstructors.implicit import implicit
-from srtomo_srtc.reconstructors.least_squares import bytes_needed
 from srtomo_srtc.split import Split
+from srtomo_srtc.split import bytes_needed as split_needs
 from srtomo_srtc.tip_tilt import in_two_loops
 
 Array = NDArray[np.float64]
@@ -81,7 +81,7 @@ def glao(
         return replace(made, provenance={**made.provenance, **details}), G
 
     layout = layout_of(system, layout)
-    require(bytes_needed(layout), f"ground-layer reconstructor of {system.name}")
+    require(_bytes_needed(system, layout), f"ground-layer reconstructor of {system.name}")
     gain = system.loop.gain if noise_gain is None else noise_gain
     stages = Stages(progress)
     stages.enter("interaction matrix", 0.0)
@@ -96,18 +96,36 @@ def glao(
 def mean_of_inverses(system: System, layout: Layout, G: Array, cutoff: float) -> Array:
     """(n_commands, n_slopes) eq. 22, over the sensors of at least half the finest one's sub-apertures across."""
     blind = blind_modes(system, layout)
-    finest = max(sensor.subapertures for sensor in system.sensors)
-    taking_part = [w for w, sensor in enumerate(system.sensors) if 2 * sensor.subapertures >= finest]
-    visible = project(G, blind)
-    R = np.zeros(G.T.shape)
-    for w in taking_part:
-        own = layout.slopes_of(w)
-        R[:, own] = np.linalg.pinv(visible[own], rcond=cutoff) / len(taking_part)
-    R = project(R.T, blind).T
+    taking_part = _taking_part(system)
+    split = None
     if len({system.star_of(sensor).tip_tilt for sensor in system.sensors}) > 1:
         split = Split.of(system, layout, G)
-        R += split.answer @ split.measured - split.low_order @ R
+    R = np.zeros(G.T.shape)
+    for w in range(len(system.sensors)):
+        own = layout.slopes_of(w)
+        if w in taking_part:
+            M = blind[own]
+            inverse = np.asarray(np.linalg.pinv(project(G[own], M), rcond=cutoff), np.float64)
+            R[:, own] = project(inverse.T, M).T / len(taking_part)
+        if split is not None:
+            R[:, own] += split.answer @ split.measured[:, own] - split.low_order @ R[:, own]
     return R
+
+
+def _taking_part(system: System) -> list[int]:
+    finest = max(sensor.subapertures for sensor in system.sensors)
+    return [w for w, sensor in enumerate(system.sensors) if 2 * sensor.subapertures >= finest]
+
+
+def _bytes_needed(system: System, layout: Layout) -> float:
+    """Memory of the optical form at its peak, about."""
+    n, m = max(layout.sensors[w].n_slopes for w in _taking_part(system)), layout.n_commands
+    least = min(n, m)
+    # both factors, their product, what was factored and its copies
+    inverse = 8.0 * (6 * n * m + 5 * least**2)
+    # both roundings of R while Q is formed
+    ending = 8.0 * (m * layout.n_slopes + 3 * m**2)
+    return 2 * 8.0 * m * layout.n_slopes + max(inverse, ending, split_needs(system, layout))
 
 
 def over_field(system: System, field: float | None = None, directions: int = DIRECTIONS) -> System:

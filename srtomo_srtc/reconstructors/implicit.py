@@ -31,6 +31,7 @@ from srtomo_srtc.model import blind_modes, noise_covariance, sightlines
 from srtomo_srtc.provenance import Stages, provenance
 from srtomo_srtc.solve import SymmetricTiles
 from srtomo_srtc.split import Split
+from srtomo_srtc.split import bytes_needed as split_needs
 from srtomo_srtc.tip_tilt import in_two_loops
 from srtomo_srtc.wind import sensors_carried, winds
 
@@ -85,7 +86,8 @@ def implicit(
     stages = Stages(progress)
 
     stages.enter("geometry", 0.0)
-    require(bytes_needed(layout, fast), f"implicit reconstructor of {system.name}")
+    low_orders = split_needs(system, layout) if split else 0.0
+    require(bytes_needed(layout, fast, low_orders), f"implicit reconstructor of {system.name}")
     profile = Profile.of(system)
     sensors = sightlines(system, layout, profile, oversampling)
     fit = Fit(system, layout, kappa)
@@ -147,11 +149,19 @@ def implicit(
     return reconstructor, G
 
 
-def bytes_needed(layout: Layout, fast: bool) -> float:
-    """Memory of :func:`implicit` at its peak, about."""
+def bytes_needed(layout: Layout, fast: bool, low_orders: float = 0.0) -> float:
+    """Memory of :func:`implicit` at its peak, about.
+
+    Args:
+        low_orders: what the split takes, if there is one (:func:`srtomo_srtc.split.bytes_needed`).
+    """
     dtype = np.dtype(np.float32 if fast else np.float64)
     matrix = layout.n_slopes * layout.n_commands
-    solving = SymmetricTiles.bytes_needed(layout.n_slopes, dtype) + matrix * dtype.itemsize
-    # R and its rounded self in float64, while Q is formed
-    ending = 2 * matrix * 8 + matrix * 4
+    tiles, right = SymmetricTiles.bytes_needed(layout.n_slopes, dtype), matrix * dtype.itemsize
+    solving = tiles + right
+    if low_orders:
+        # the lasers' own part of both, and what comes of them
+        solving = tiles + right + max(low_orders, tiles + 2 * right)
+    # R in float64, and twice in float32, while Q is formed
+    ending = matrix * (8 + 2 * 4)
     return matrix * 8 + 3 * 8 * layout.n_commands**2 + max(solving, ending)

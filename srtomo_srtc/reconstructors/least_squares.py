@@ -73,8 +73,8 @@ def least_squares(
 
 
 def bytes_needed(layout: Layout) -> float:
-    """Memory of an inverse of the interaction matrix at its peak, about."""
-    return 8.0 * layout.n_commands * (5 * layout.n_slopes + 3 * layout.n_commands)
+    """Memory of :func:`least_squares` at its peak, about: D, weighted, R and a copy, and the normal equations."""
+    return 8.0 * layout.n_commands * (4 * layout.n_slopes + 2 * layout.n_commands)
 
 
 def weighted_inverse(D: Array, weight: sparse.sparray, blind: Array, kappa: float) -> Array:

@@ -81,7 +81,7 @@ def predictive(
     believed = with_trusted_winds(system, wind_uncertainty)
     layout = layout_of(system, layout)
     if epochs > 1:
-        require(_bytes_needed(layout, epochs, fast), f"predictive reconstructor of {system.name}")
+        require(_bytes_needed(layout, epochs, fast, split), f"predictive reconstructor of {system.name}")
     said = {"wind_uncertainty": np.asarray(wind_uncertainty, dtype=np.float64).tolist()}
     alone_is = 1 / (1 + epochs**2) if epochs > 1 else 1.0  # of the work, about
 
@@ -168,11 +168,15 @@ def _of_several(split: Split, n_slopes: int, epochs: int) -> Split:
     )
 
 
-def _bytes_needed(layout: Layout, epochs: int, fast: bool) -> float:
+def _bytes_needed(layout: Layout, epochs: int, fast: bool, split: bool) -> float:
     """Memory of :func:`predictive` with several exposures at its peak, about."""
     dtype = np.dtype(np.float32 if fast else np.float64)
     n, m = epochs * layout.n_slopes, layout.n_commands
     right = m * n * dtype.itemsize
     # R and its copies in float32, one of them frozen, while Q is formed
     ending = right + (2 * 4 * n_parts(epochs) + 8) * m * layout.n_slopes
-    return 2 * 8 * m * layout.n_slopes + 3 * 8 * m**2 + max(SymmetricTiles.bytes_needed(n, dtype) + right, ending)
+    solving = SymmetricTiles.bytes_needed(n, dtype) + right
+    if split:
+        # the lasers' own part of both, and what comes of them
+        solving += solving + right
+    return 2 * 8 * m * layout.n_slopes + 3 * 8 * m**2 + max(solving, ending)
