@@ -43,6 +43,13 @@ def test_arithmetic_before_the_factor(S: np.ndarray) -> None:
     np.testing.assert_allclose(projected.dense(), P @ S @ P + 2.0 * M @ M.T, atol=1e-9)
 
 
+def test_a_part_is_that_of_the_matrix(S: np.ndarray) -> None:
+    which = np.concatenate([np.arange(3, 900, 2), np.arange(1100, len(S))])
+    np.testing.assert_array_equal(
+        SymmetricTiles.of(S).part(which).dense(), SymmetricTiles.of(S).dense()[np.ix_(which, which)]
+    )
+
+
 @pytest.mark.parametrize(("dtype", "error"), [(np.float64, 1e-12), (np.float32, 1e-4)])
 @pytest.mark.parametrize("threads", [1, 3])
 def test_division(S: np.ndarray, dtype: type, error: float, threads: int) -> None:
