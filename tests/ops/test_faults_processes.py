@@ -96,6 +96,13 @@ class Instrument:
         self.recorder = self.start("record", *CHANGES, "-o", self.bag, "--json", self.folder / "recorder.json")
         self.recorder.wait_for("recording", PATIENCE)
         self.recorder_status(lambda status: status.bag.endswith(self.bag.name) and status.frames > 0)
+        self.until(self._can_be_replayed, lambda: f"{self.bag}: no events or no state")
+
+    def _can_be_replayed(self) -> bool:
+        """Slopes and commands come from the ring at once. What a replay starts from comes by the middleware, which to
+        a process that takes the place of a killed one may take seconds to find its way."""
+        with BagReader(self.bag) as reader:
+            return all(reader.counts.get(f"/{topic.name}") for topic in (wire.EVENT, wire.STATE))
 
     def end_recorder(self) -> dict[str, Any]:
         """Its report. It began in the middle: what it missed before it had found everybody is lost (exit status 1)."""
