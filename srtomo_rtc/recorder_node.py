@@ -58,6 +58,7 @@ _OVERLAP = 1.0  # s after a change between ring and subscriptions for which both
 _REMEMBERED = 10  # queues' worth of messages, which may come by both
 _QUIET = 0.25  # s without a message in the ring after which the subscriptions are looked at too
 _RING_CHANNELS = (SLOPES, COMMAND)
+_RING, _SUBSCRIPTION = 0, 1  # ways by which these come
 
 
 _UNRECORDED = "a publisher offers less than reliable (or transient local) delivery, and is not recorded"
@@ -254,11 +255,8 @@ class Recorder:
             if tap.topic in _RING_CHANNELS and self._ring.attached and since_change > _OVERLAP:
                 continue  # stands by
             with tap.subscription.handle:
-                batch += tap.take()
+                batch += [record for record in tap.take() if self._is_news(record, _SUBSCRIPTION)]
         batch.sort(key=itemgetter(0))
-        # a message that came by one way late in the overlap comes by the other after it
-        changing = since_change <= 2 * _OVERLAP
-        batch = [record for record in batch if self._is_news(record) or not changing]
         if not batch:
             return False
         for record in batch:
@@ -267,9 +265,9 @@ class Recorder:
         return True
 
     @staticmethod
-    def _is_news(record: _Record) -> bool:
-        """False for one that has come already, if it can come by two ways."""
-        return record.tap.topic not in _RING_CHANNELS or record.tap.recent.add(record.data)
+    def _is_news(record: _Record, way: int) -> bool:
+        """False for one that has come by the other way, if there are two."""
+        return record.tap.topic not in _RING_CHANNELS or record.tap.recent.add(record.data, way)
 
     def _take_ring(self) -> list[_Record]:
         before = self._ring.attached, self._ring.overruns
@@ -287,7 +285,7 @@ class Recorder:
             if tap is not None:
                 received = self._clock.start + arrived
                 batch.append(_Record(received, tap, data, received, 0))
-        return batch
+        return [record for record in batch if self._is_news(record, _RING)]
 
     def _book(self, record: _Record) -> None:
         record.tap.recorded += 1

@@ -88,22 +88,26 @@ class RingSource:
 
 
 class Recent:
-    """The last messages of a topic, told by their bytes.
+    """The last messages of a topic that come by two ways, told by their bytes: whichever copy comes first is news.
+
+    However late the other one is. A message that was sent twice comes twice by each way, and is news twice.
 
     Args:
-        count: how many are remembered.
+        count: how many different ones are remembered.
     """
 
     def __init__(self, count: int) -> None:
         self._count = count
-        self._seen: OrderedDict[int, None] = OrderedDict()
+        self._seen: OrderedDict[int, tuple[int, int]] = OrderedDict()
 
-    def add(self, data: bytes) -> bool:
-        """Put a message in; False if it is there already."""
+    def add(self, data: bytes, way: int) -> bool:
+        """Put in a message that came by way 0 or 1; False if it has come by the other already."""
         key = hash(data)
-        new = key not in self._seen
-        self._seen[key] = None
+        first, second = self._seen.get(key, (0, 0))
+        mine, other = (first, second) if way == 0 else (second, first)
+        mine += 1
+        self._seen[key] = (mine, other) if way == 0 else (other, mine)
         self._seen.move_to_end(key)
         if len(self._seen) > self._count:
             self._seen.popitem(last=False)
-        return new
+        return mine > other

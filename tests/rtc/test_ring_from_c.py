@@ -119,6 +119,8 @@ def test_a_source_comes_and_goes_with_its_ring(tmp_path):
     assert source.messages == 3
 
 
-def test_recent_messages_are_known_by_their_bytes():
+def test_a_message_that_comes_by_two_ways_is_news_once_and_one_sent_twice_twice():
     recent = Recent(2)
-    assert [recent.add(data) for data in (b"a", b"b", b"a", b"c", b"a", b"b")] == [True, True, False, True, False, True]
+    came = [(b"a", 0), (b"a", 1), (b"b", 1), (b"b", 0), (b"b", 0), (b"b", 1), (b"b", 1)]
+    assert [recent.add(*one) for one in came] == [True, False, True, False, True, False, True]
+    assert [recent.add(*one) for one in ((b"c", 0), (b"b", 0), (b"a", 1))] == [True, False, True]  # a is forgotten
