@@ -197,6 +197,12 @@ class BagWriter:
         kept = depth if transient_local and self._split_bytes is not None else 0
         self._declare(topic, type_name, definition(type_name), details, kept)
 
+    def keep(self, topic: str, count: int) -> None:
+        """Repeat no more than the last ``count`` messages of a declared transient local topic in later files."""
+        written = self._topics.get(topic)
+        if written is not None and written.latched.maxlen:
+            written.latched = deque(written.latched, count)
+
     def _declare(self, topic: str, type_name: str, text: str, details: dict[str, str], kept: int = 0) -> None:
         written = _WrittenTopic(type_name, text, details, deque(maxlen=kept))
         try:

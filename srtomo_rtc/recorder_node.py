@@ -30,6 +30,7 @@ from typing import Any, NamedTuple
 
 import rclpy
 from msgs_schema.msg import HrtcEvent, RecorderStatus
+from msgs_schema.msg import Reconstructor as ReconstructorMsg
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message
@@ -41,7 +42,16 @@ from srtomo_core.clock import ArrivalClock
 from srtomo_core.layout import Layout
 from srtomo_core.ring import ring_path
 from srtomo_core.system import InstrumentError, System, load_system
-from srtomo_core.wire import COMMAND, EVENT, RECORDER_STATUS, SLOPES, TOPICS, Topic
+from srtomo_core.wire import (
+    COMMAND,
+    EVENT,
+    RECONSTRUCTOR,
+    RECONSTRUCTOR_BLOCK,
+    RECORDER_STATUS,
+    SLOPES,
+    TOPICS,
+    Topic,
+)
 from srtomo_rtc.ledger import Ledger
 from srtomo_rtc.ring_source import Recent, RingSource
 
@@ -153,11 +163,19 @@ class _Scribe(threading.Thread):
                 return
             for record in batch:
                 tap = record.tap
+                if tap.topic is RECONSTRUCTOR:
+                    self._keep_two(record)
                 self._bag.write(tap.name, tap.topic.type, record.data, record.received, record.sent, record.sequence)
                 self._written += len(record.data)
             if time.monotonic() >= flush_at:
                 self._bag.flush()
                 flush_at = time.monotonic() + _FLUSH_PERIOD
+
+    def _keep_two(self, manifest: _Record) -> None:
+        """Have later files repeat the blocks of two reconstructors, as their writer keeps them: they are large."""
+        blocks = manifest.tap.name.removesuffix(RECONSTRUCTOR.name) + RECONSTRUCTOR_BLOCK.name
+        n_blocks = deserialize_message(manifest.data, ReconstructorMsg).n_blocks
+        self._bag.keep(blocks, min(2 * n_blocks, RECONSTRUCTOR_BLOCK.depth))
 
 
 class Recorder:

@@ -50,13 +50,14 @@ BAD = (*_REFUSED, _LEFT)
 class Sending:
     """Publishes reconstructors as an SRTC does, good and bad."""
 
-    def __init__(self, operator: Operator) -> None:
+    def __init__(self, operator: Operator, n_commands: int) -> None:
         self._operator = operator
+        two = 2 * len(block_table(n_commands, 1))
         self._manifests = operator.create_publisher(
             ReconstructorMsg, wire.RECONSTRUCTOR.name, QoSProfile(**wire.RECONSTRUCTOR.qos())
         )
         self._blocks = operator.create_publisher(
-            ReconstructorBlockMsg, wire.RECONSTRUCTOR_BLOCK.name, QoSProfile(**wire.RECONSTRUCTOR_BLOCK.qos())
+            ReconstructorBlockMsg, wire.RECONSTRUCTOR_BLOCK.name, QoSProfile(**wire.RECONSTRUCTOR_BLOCK.qos(two))
         )
 
     def send(self, one: Reconstructor, fault: str = "") -> None:
@@ -100,7 +101,7 @@ class Swapping:
 
     def __init__(self, operator: Operator, good: list[Reconstructor], bad: Reconstructor) -> None:
         self._operator, self._good, self._bad = operator, good, bad
-        self._sending = Sending(operator)
+        self._sending = Sending(operator, bad.n_commands)
         self._clients = {
             name: operator.create_client(SwapReconstructor, f"hrtc/{name}") for name in ("commit", "roll_back")
         }
@@ -278,9 +279,11 @@ class Driver:
         self.wait_for(lambda: swapping.all_refused, "bad reconstructors refused")
 
     def status_after(self, frame: int) -> dict[str, Any]:
-        """The HRTC's numbers once it says that it has answered a frame."""
+        """The HRTC's numbers once it says that it has answered a frame; a status made meanwhile is not counted."""
         operator = self.operator
-        self.wait_for(lambda: operator.hrtc is not None and operator.hrtc.frame >= frame, "the last status")
+        for _ in range(2):
+            operator.hrtc = None
+            self.wait_for(lambda: operator.hrtc is not None and operator.hrtc.frame >= frame, "the last status")
         assert operator.hrtc is not None
         names = operator.hrtc.get_fields_and_field_types()
         return {name: getattr(operator.hrtc, name) for name in names if name != "header"}

@@ -408,6 +408,19 @@ def test_finished_files_may_be_deleted_meanwhile(tmp_path, small_chunks):
     assert frames_of(path)[-1] == 599
 
 
+def test_later_files_repeat_no_more_than_asked_for(tmp_path, small_chunks):
+    with BagWriter(tmp_path / "night", {}, split_bytes=1000) as writer:
+        writer.declare(EVENTS, wire.EVENT.type, depth=4096, transient_local=True)
+        for number in range(40):
+            writer.write(EVENTS, wire.EVENT.type, event(str(number)), START + number, START + number)
+        writer.keep(EVENTS, 3)
+        writer.keep("/unknown", 3)
+        writer.flush()
+    with BagReader(tmp_path / "night" / "night_1.mcap") as second:
+        texts = [typestore().deserialize_cdr(m.data, m.type).text for m in second]
+    assert texts == ["37", "38", "39"]
+
+
 def test_a_split_bag_that_was_cut_is_mended_whole(tmp_path, small_chunks):
     path = tmp_path / "night"
     write_split(path, 300, split_bytes=20_000)

@@ -189,7 +189,7 @@ def test_memory_that_grows() -> None:
     leaking = Memory.of(times, [size + int(2e6 * t) for t, size in zip(times, warming, strict=True)], 10**6)
     assert leaking.growth == pytest.approx(2e6 * 49.5, rel=1e-6)
     assert not leaking.flat(10**6)
-    assert Memory.of(times, warming, 10**5).growth is None
+    assert Memory.of(times, warming, 20_000).growth is None
 
 
 def soak(start_process: Any, tmp_path: Path, *words: str) -> tuple[dict[str, Any], Any]:
