@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import lru_cache, partial
 from itertools import pairwise
 
 import numba
@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from srtomo_srtc.atmosphere import CovarianceTable, Profile
-from srtomo_srtc.geometry import Footprints, SeenLattice
+from srtomo_srtc.geometry import Footprints, Lattice, SeenLattice
 from srtomo_srtc.lattice import Correlator, PairTable, is_on_lattice
 from srtomo_srtc.layered import WIDEST, LayeredCorrelator, Neighbours
 from srtomo_srtc.parallel import Progress, run, silent
@@ -125,6 +125,30 @@ def slope_tiles(
                 for subapertures in _stretches(first.gradient.shape[0] // 2, 4 * second.gradient.shape[0])
             ]
     run(tasks, threads, progress)
+    return out
+
+
+def slope_cross_covariance(
+    turbulence: Turbulence, rows: Sequence[Sightline], columns: Sequence[Sightline]
+) -> NDArray[np.float32]:
+    """Covariance of the slopes of some sightlines with those of others, as :func:`slope_tiles` has it with ``fast``.
+
+    Returns:
+        (n_row_slopes, n_column_slopes) rad^2.
+    """
+    down, right = (np.cumsum([0] + [line.gradient.shape[0] for line in lines]) for lines in (rows, columns))
+    out = np.empty((down[-1], right[-1]), np.float32)
+    for i, first in enumerate(rows):
+        for j, second in enumerate(columns):
+            correlate = _node_correlation(turbulence, first, second, True)
+            here = out[down[i] : down[i + 1], right[j] : right[j + 1]]
+            stretches = list(_stretches(first.gradient.shape[1], second.gradient.shape[0]))
+            if len(stretches) == 1:
+                here[:] = first.gradient @ correlate(stretches[0])
+                continue
+            here[:] = 0
+            for some in stretches:
+                here += first.gradient[:, some] @ correlate(some)
     return out
 
 
@@ -238,11 +262,16 @@ Correlate = Callable[[slice], Matrix]
 """Covariance of a stretch of points with all slopes of one sensor: (n_points, n_slopes) rad m."""
 
 
+@lru_cache(maxsize=128)
+def _centres(points: Lattice, lattice: Lattice) -> Array:
+    return lattice.to_steps(*points.points())
+
+
 def _node_correlation(turbulence: Turbulence, first: Sightline, second: Sightline, fast: bool) -> Correlate:
     """Of the first sensor's nodes with the second sensor's slopes."""
     a, b = first.seen, second.seen
     if a is not None and b is not None and np.array_equal(a.cones, b.cones):
-        centres = b.lattice.to_steps(*a.lattice.points())
+        centres = _centres(a.lattice, b.lattice)
         if fast or is_on_lattice(centres):
             table = PairTable.build(
                 b.lattice, centres, b.cones, b.offsets - a.offsets, turbulence.fractions, turbulence.table

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,9 +51,9 @@ def footprints(x: Array, y: Array, direction: Direction, distance: float, height
     return Footprints(cone * x + h * direction.x, cone * y + h * direction.y)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Lattice:
-    """A sensor's nodes as part of a square lattice in its own axes.
+    """A sensor's nodes as part of a square lattice in its own axes. What follows from it is found once and kept.
 
     Attributes:
         step: m.
@@ -69,6 +70,7 @@ class Lattice:
     row: NDArray[np.int64]
     column: NDArray[np.int64]
 
+    @lru_cache(maxsize=64)  # noqa: B019 - few and small
     def points(self) -> tuple[Array, Array]:
         """x, y of the nodes in the pupil, m."""
         x, y = self.origin[0] + self.step * self.column, self.origin[1] + self.step * self.row
@@ -81,6 +83,7 @@ class Lattice:
         c, s = math.cos(self.rotation), math.sin(self.rotation)
         return np.stack([c * y - s * x - self.origin[1], c * x + s * y - self.origin[0]], axis=-1) / self.step
 
+    @lru_cache(maxsize=64)  # noqa: B019 - few and small
     def rows(self, multiple: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """The rows of the lattice that have nodes, in pieces of a multiple of so many columns.
 

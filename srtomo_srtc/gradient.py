@@ -52,16 +52,20 @@ class GradientOperator:
     lattice: Lattice
 
 
-def gradient_operator(telescope: Telescope, sensor: SensorLayout, oversampling: int = OVERSAMPLING) -> GradientOperator:
+def gradient_operator(
+    telescope: Telescope, sensor: SensorLayout, oversampling: int = OVERSAMPLING, *, cells: int | None = None
+) -> GradientOperator:
     """The operator of one sensor, where ``sensor`` says that it is.
 
     Args:
         oversampling: 1 has nodes at a sub-aperture's corners only, 2 is the 3 x 3 stencil of eq. 28, 4 has 5 x 5 nodes.
+        cells: of nodes across a sub-aperture, however large, in place of what ``oversampling`` makes.
 
     Raises:
         ValueError: a sub-aperture is dark, so its slope means nothing.
     """
-    cells = oversampling * max(1, math.ceil(sensor.size / LARGEST_SUBAPERTURE - 1e-9))
+    if cells is None:
+        cells = oversampling * max(1, math.ceil(sensor.size / LARGEST_SUBAPERTURE - 1e-9))
     light, u, v = cell_light(telescope, sensor, cells, _FINE)
     total = light.sum(axis=(1, 2), keepdims=True)
     if not total.all():

@@ -45,9 +45,11 @@ _CONVERGED = 1e-6  # squared step over the squared error from one frame
 _NEAR = 1e-2  # likewise: closer, the information is that of the solution
 _ITERATIONS = 20
 _RELINEARISE = 0.15  # change of log L0 that the derivative is not trusted with
+_DIFFERENCE = 1.05  # of outer scales, for the derivative
 _STRIDE = 1.0  # of log L0 in an iteration, at most
 _EVERYWHERE = 0.1  # of the turbulence to start from: a layer without any is slow to gain some
 _FEWEST = 50  # frames
+_FEW = 400  # slopes to start with
 _RIDGE = 1e-7  # of the information, where layers are all but the same
 
 
@@ -179,26 +181,31 @@ class Fit:
     iterations: int
 
 
-def fit(model: SkyModel, S: NDArray[np.floating], strengths: Array, outer_scale: float) -> Fit:
+def fit(
+    model: SkyModel, S: NDArray[np.floating], strengths: Array, outer_scale: float, levels: Array | None = None
+) -> Fit:
     """Find the sky under which slopes with the second moment ``S`` are most likely, by Fisher scoring.
 
     Args:
         S: (n, n) as :meth:`SkyModel.measured` gives it, rad^2.
         strengths: (n_layers,) to start from; their sum is not used.
         outer_scale: to start from, m.
+        levels: (n_sensors,) of noise to start from; 1 when not given.
 
     Raises:
         LearnError: the fit does not converge, or ends where no sky is.
     """
     n_layers = len(strengths)
-    noise = np.array([n.trace() for n in model.noise])
+    start = np.ones(len(model.noise)) if levels is None else levels
     shape = np.asarray(strengths, np.float64) / np.sum(strengths)
-    per_strength = float(model.turbulence(shape, outer_scale).trace())
-    scale = max(float(S.trace()) - noise.sum(), 0.1 * float(S.trace())) / per_strength
-    theta = np.concatenate([scale * shape, [outer_scale**-_POWER], np.ones(len(noise))])
-    unseen = model.unseen(float(S.trace()) / len(S)).astype(np.float64)
-    far, at = True, math.nan  # outer scale that the bases belong to
-    layers: list[NDArray[np.float32]] = []
+    at = outer_scale  # that the bases belong to
+    layers = [model.layer(l, at) for l in range(n_layers)]
+    per_strength = shape @ [layer.trace() for layer in layers]
+    trace = float(S.trace())
+    scale = max(trace - start @ [noise.trace() for noise in model.noise], 0.1 * trace) / per_strength
+    theta = np.concatenate([scale * shape, [outer_scale**-_POWER], start])
+    unseen = model.unseen(trace / len(S)).astype(np.float64)
+    far = True
     for iteration in range(1, _ITERATIONS + 1):
         c, outer_scale, levels = theta[:n_layers], theta[n_layers] ** (-1 / _POWER), theta[n_layers + 1 :]
         moved = not abs(math.log(outer_scale / at)) < _RELINEARISE
@@ -206,14 +213,17 @@ def fit(model: SkyModel, S: NDArray[np.floating], strengths: Array, outer_scale:
             at = outer_scale
             layers = [model.layer(l, at) for l in range(n_layers)]
         if moved or far:
-            slope = model.by_log_outer_scale(c, at) / np.float32(-_POWER * at**-_POWER)
+            # nearly linear: a difference to one side will do
+            near = at / _DIFFERENCE
+            slope = model.turbulence(c, near) - _total(layers, c).astype(np.float32)
+            slope /= np.float32(near**-_POWER - at**-_POWER)
         C = unseen + _total(layers, c) + _total(model.noise, levels)
         C += (theta[n_layers] - at**-_POWER) * slope
         bases = [*layers, slope, *model.noise]
         try:
             inverse = inverse_of(C).astype(np.float32)
             if far:
-                F = information(inverse, bases)
+                F = information(model.seen(inverse), [*layers, slope, *model.whole_noise])
                 F[np.diag_indices_from(F)] *= 1 + _RIDGE
             g = score(inverse, (S + unseen - C).astype(np.float32), bases)
             if not (np.isfinite(F).all() and np.isfinite(g).all() and np.all(np.diag(F) > 0)):
@@ -300,8 +310,25 @@ def learn(
         raise LearnError("the covariance is not finite")
     if not S.trace() > 0:
         raise LearnError("the slopes do not move")
-    found = fit(model, S, strengths_at(system, grid), system.atmosphere.outer_scale)
+    found = fit(model, S, *_start(system, layout, model, statistics, limit))
     return _told(system, layout, model, found, S, statistics, grid, flow, limit)
+
+
+def _start(
+    system: System, layout: Layout, model: SkyModel, statistics: Statistics, limit: int
+) -> tuple[Array, float, Array | None]:
+    """Strengths, outer scale and noise levels to start from: found from fewer slopes, where there are many."""
+    start = strengths_at(system, model.heights / system.airmass), system.atmosphere.outer_scale
+    few = min(_FEW, limit // 2)
+    if len(model) > 2 * few:
+        rough = SkyModel(system, layout, Sampling.of(system, layout, few, 4), model.heights)
+        try:
+            found = fit(rough, rough.measured(statistics.covariance, statistics.mean), *start)
+        except LearnError:
+            pass
+        else:
+            return found.strengths, found.outer_scale, found.levels
+    return *start, None
 
 
 def photons_for(system: System, sensor: Sensor, place: SensorLayout, factor: float) -> float:
@@ -430,13 +457,13 @@ def _independent(
     limit: int,
 ) -> Array:
     """(n_told,) independent frames, from a coarse model: only ratios matter."""
-    coarse = SkyModel(system, layout, Sampling.of(system, layout, limit, 1), model.heights)
+    coarse = SkyModel(system, layout, Sampling.of(system, layout, limit, 2), model.heights)
     return independent_frames(
         coarse,
         found.strengths,
         found.outer_scale,
         inverse_of(found.covariance),
-        [_total(found.bases, row) for row in influences],
+        [_total(found.bases, row).astype(np.float32) for row in influences],
         velocity,
         min(part.place.size for part in model.sampling.parts),
         statistics.duration / (statistics.n_frames - 1),

@@ -35,11 +35,14 @@ UNSEEN = 3.0
 _SPEEDS = np.arange(0.0, 31.0, 5.0)  # m/s, of the grid
 _DIRECTIONS = 12  # an even number
 _STEP = 0.3  # m/s, of the central differences
-_ITERATIONS = 8
-_CLOSE = 0.02  # m/s: a step this small is the last
+_ITERATIONS = 20
+_DAMPED = 1e-3  # of the best seen component's information: a layer that is hardly seen stays where it is
+_CLOSE = 0.01  # m/s: a step this small is the last
+_CURVED = 0.2  # m/s: farther, derivatives are made anew
 _STRIDE = 4.0  # m/s: of an iteration, at most
 _FASTEST = 60.0  # m/s
-_LAGS = 100  # in counted frames, at most, over which frames that resemble each other are summed
+_LAGS = 100  # in counted frames, about, over which frames that resemble each other are summed
+_RATIO = 1.3  # of those that are looked at
 _FORGOTTEN = 1e-3  # of that sum: what comes after it is left out
 
 
@@ -100,13 +103,13 @@ def learn_winds(
     if not statistics.lagged:
         raise ValueError("wind: expected statistics with lagged moments")
     profile = Profile.of(system)
-    model = SkyModel(system, layout, Sampling.of(system, layout, limit, oversampling=2), profile.heights)
+    model = SkyModel(system, layout, Sampling.of(system, layout, limit, cells=2), profile.heights)
     per_frame = 1 / system.loop.rate
     measured = {lag * per_frame: model.measured(matrix).astype(np.float64) for lag, matrix in statistics.lagged.items()}
     pairs = min(statistics.lagged_frames.values())
     flow = _Flow(model, profile, measured)
-    found = flow.refine(flow.search())
-    covariance = flow.covariance(found, pairs, statistics.interval)
+    found, slopes = flow.refine(flow.search())
+    covariance = flow.covariance(found, slopes, pairs, statistics.interval)
     layers = [
         (layer.altitude, fraction)
         for layer, fraction in zip(system.atmosphere.layers, system.atmosphere.fractions, strict=True)
@@ -140,6 +143,19 @@ def _wind(altitude: float, fraction: float, velocity: Array, covariance: Array) 
     elif math.hypot(*velocity) >= _FASTEST:
         reason = f"no wind below {_FASTEST:g} m/s fits"
     return LayerWind(altitude, fraction, (float(velocity[0]), float(velocity[1])), covariance, reason)
+
+
+@dataclass(frozen=True, eq=False)
+class _Slope:
+    """How a lagged covariance changes with the winds.
+
+    Attributes:
+        whitened: (n, n) derivatives by each component of each velocity, layer by layer, whitened.
+        information: (2 n_layers, 2 n_layers) their products with the derivatives.
+    """
+
+    whitened: list[Array]
+    information: Array
 
 
 class _Flow:
@@ -190,21 +206,40 @@ class _Flow:
             left -= self._whitened(taken)
         return found
 
-    def refine(self, velocities: Array) -> Array:
-        """(n_layers, 2) the velocities that fit all lags best, m/s, from those given."""
-        velocities = velocities.copy()
+    def refine(self, velocities: Array) -> tuple[Array, dict[float, _Slope]]:
+        """The velocities that fit all lags best, from those given.
+
+        Returns:
+            (n_layers, 2) m/s, and what each lag is like about there.
+        """
+        velocities, at = velocities.copy(), np.full(velocities.shape, np.inf)
+        slopes: dict[float, _Slope] = {}
+        seen = np.ones(velocities.size)  # of each component, relative to the best: what is hardly seen decides nothing
         for _ in range(_ITERATIONS):
-            information, score = self._normal(velocities)
-            # a layer that is hardly seen stays where it is
-            ridge = np.diag(np.diag(information) * 1e-3 + np.diag(information).max() * 1e-6)
+            if (seen * np.abs(velocities - at).ravel()).max() > _CURVED:
+                at = velocities.copy()
+                slopes = {time: self._slope(at, time) for time in self._measured}
+                information = np.sum([slope.information for slope in slopes.values()], axis=0)
+                diagonal = np.diag(information)
+                seen = np.sqrt(diagonal / diagonal.max())
+                ridge = np.diag(diagonal + diagonal.max()) * _DAMPED
+            score = np.zeros(velocities.size)
+            for time, measured in self._measured.items():
+                left = measured - self._model.lagged(self._strengths, self._outer_scale, velocities, time)
+                score += [np.vdot(W, left) for W in slopes[time].whitened]
             step = np.linalg.solve(information + ridge, score)
             step *= min(1.0, _STRIDE / max(float(np.abs(step).max()), 1e-9))
             velocities += step.reshape(-1, 2)
             speed = np.hypot(*velocities.T)[:, None]
             velocities *= np.minimum(1, _FASTEST / np.maximum(speed, 1e-9))
-            if np.abs(step).max() < _CLOSE:
+            if (seen * np.abs(step)).max() < _CLOSE:
                 break
-        return velocities
+        return velocities, slopes
+
+    def _slope(self, velocities: Array, time: float) -> _Slope:
+        derivatives = self._derivatives(velocities, time)
+        whitened = [self._whitened(D) for D in derivatives]
+        return _Slope(whitened, np.array([[np.vdot(W, D) for D in derivatives] for W in whitened]))
 
     def _derivatives(self, velocities: Array, time: float) -> list[Array]:
         """Of the lagged covariance by each component of each velocity, layer by layer."""
@@ -215,19 +250,7 @@ class _Flow:
                 out.append((ahead - behind) / (2 * _STEP))
         return out
 
-    def _normal(self, velocities: Array) -> tuple[Array, Array]:
-        """Normal equations: (2 n_layers, 2 n_layers) and (2 n_layers,)."""
-        n = velocities.size
-        information, score = np.zeros((n, n)), np.zeros(n)
-        for time, measured in self._measured.items():
-            model = self._model.lagged(self._strengths, self._outer_scale, velocities, time)
-            derivatives = self._derivatives(velocities, time)
-            whitened = [self._whitened(D) for D in derivatives]
-            information += np.array([[np.vdot(W, D) for D in derivatives] for W in whitened])
-            score += np.array([np.vdot(W, measured - model) for W in whitened])
-        return information, score
-
-    def covariance(self, velocities: Array, pairs: int, interval: float) -> Array:
+    def covariance(self, velocities: Array, slopes: Mapping[float, _Slope], pairs: int, interval: float) -> Array:
         """(2 n_layers, 2 n_layers) of the velocities, m^2/s^2.
 
         Of the lag that tells most, as if there were no other: lags largely repeat each other. With Q_p the whitened
@@ -235,29 +258,27 @@ class _Flow:
         after it follows from frozen flow too.
 
         Args:
+            slopes: what each lag is like about there.
             pairs: of exposures in the measured moments.
             interval: s between counted frames.
         """
-        best: tuple[Array, list[Array]] | None = None
-        for time in self._measured:
-            derivatives = self._derivatives(velocities, time)
-            whitened = [self._whitened(D) for D in derivatives]
-            information = np.array([[np.vdot(W, D) for D in derivatives] for W in whitened])
-            if best is None or information.trace() > best[0].trace():
-                best = information, whitened
-        assert best is not None
-        information, whitened = best
-        spread = np.zeros_like(information)
-        for j in range(_LAGS + 1):
-            later = (
-                self._C
-                if j == 0
-                else self._model.lagged(self._strengths, self._outer_scale, velocities, j * interval).astype(np.float64)
-            )
-            moved = [later @ Q @ later.T for Q in whitened]
-            part = np.array([[np.vdot(Q, M) for M in moved] for Q in whitened])
-            spread += part if j == 0 else part + part.T
-            if j and np.abs(np.diag(part)).max() < _FORGOTTEN * np.diag(spread).min():
-                break
-        inverse = np.linalg.pinv(information, rcond=1e-9, hermitian=True)
+        best = max(slopes.values(), key=lambda slope: float(slope.information.trace()))
+        frames, parts = [0], [self._repeated(best.whitened, self._C)]
+        spread = parts[0].copy()
+        while frames[-1] < _LAGS and np.diag(abs(parts[-1])).max() > _FORGOTTEN * np.diag(spread).min():
+            frames.append(max(frames[-1] + 1, round(_RATIO * frames[-1])))
+            C = self._model.lagged(self._strengths, self._outer_scale, velocities, frames[-1] * interval)
+            parts.append(self._repeated(best.whitened, C.astype(np.float64)))
+            # linear in between
+            first, last = frames[-2:]
+            share = np.arange(1, last - first + 1) / (last - first)
+            part = (1 - share).sum() * parts[-2] + share.sum() * parts[-1]
+            spread += part + part.T
+        inverse = np.linalg.pinv(best.information, rcond=1e-9, hermitian=True)
         return np.asarray(inverse @ spread @ inverse / pairs)
+
+    @staticmethod
+    def _repeated(whitened: Sequence[Array], later: Array) -> Array:
+        """tr(Q_p^T C Q_q C^T) for C the covariance of slopes with earlier ones."""
+        moved = [later @ Q @ later.T for Q in whitened]
+        return np.array([[np.vdot(Q, M) for M in moved] for Q in whitened])

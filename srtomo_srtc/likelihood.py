@@ -15,6 +15,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import sparse
 from scipy.linalg import lapack
 from scipy.optimize import nnls
 
@@ -22,12 +23,12 @@ Array = NDArray[np.float64]
 Single = NDArray[np.float32]
 
 
-def information(inverse: Single, bases: Sequence[Single]) -> Array:
+def information(inverse: Single, bases: Sequence[Single | sparse.csr_array]) -> Array:
     """(n_parameters, n_parameters) F of one frame.
 
     Args:
         inverse: (n, n) C^-1.
-        bases: (n, n) B_i of each parameter.
+        bases: (n, n) B_i of each parameter; a sparse one saves a product.
     """
     F = np.empty((len(bases), len(bases)))
     turned: list[Single] = []

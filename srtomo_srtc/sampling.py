@@ -25,9 +25,9 @@ from srtomo_srtc.model import blind_modes
 
 Array = NDArray[np.float64]
 
-OVERSAMPLING = 4
-"""Node cells across a single sub-aperture. With two, the paper's, 4 % of the slopes' variance is missing from the
-model, up to 15 % in the middle eigen-bands."""
+CELLS = 8
+"""Node cells across a sub-aperture, and across a block. With two, the paper's, 4 % of the slopes' variance is missing
+from the model, up to 15 % in the middle eigen-bands; what coarse blocks lack is taken for noise."""
 
 _IN_BLOCKS = 0.6  # of the slopes, at most
 _CENTRE = 0.55  # of the pupil's radius: of the part with single sub-apertures
@@ -40,12 +40,12 @@ class Part:
     Attributes:
         sensor: index.
         place: where they are.
-        oversampling: node cells across one.
+        cells: of nodes across one.
     """
 
     sensor: int
     place: SensorLayout
-    oversampling: int
+    cells: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +65,7 @@ class Sampling:
     sensors: NDArray[np.intp]
 
     @classmethod
-    def of(cls, system: System, layout: Layout, limit: int, oversampling: int = OVERSAMPLING) -> Sampling:
+    def of(cls, system: System, layout: Layout, limit: int, cells: int = CELLS) -> Sampling:
         """At most about ``limit`` slopes, of sensors with more than one sub-aperture.
 
         The tip-tilt of a one-lens sensor has the telescope's shake in it, and its noise is lost under the atmosphere's.
@@ -76,9 +76,7 @@ class Sampling:
         many = [w for w, place in enumerate(layout.sensors) if place.n_valid > 1]
         if not many:
             raise ValueError(f"{system.name}: expected a sensor with more than one sub-aperture")
-        found = [
-            pair for w in many for pair in _parts(system, layout.sensors[w], w, limit / len(many) / 2, oversampling)
-        ]
+        found = [pair for w in many for pair in _parts(system, layout.sensors[w], w, limit / len(many) / 2, cells)]
         # large ones last: their nodes are among those of the small ones, which saves interpolation
         found.sort(key=lambda pair: pair[0].place.size)
         parts = [part for part, _ in found]
@@ -97,7 +95,7 @@ class Sampling:
         lines = []
         for part in self.parts:
             star = system.star_of(system.sensors[part.sensor])
-            operator = gradient_operator(system.telescope, part.place, max(1, part.oversampling // coarser))
+            operator = gradient_operator(system.telescope, part.place, cells=max(1, part.cells // coarser))
             aim = star.position, system.los_range(star), profile.heights
             lines.append(
                 Sightline(
@@ -124,11 +122,11 @@ def _wide(layout: Layout, part: Part, mean: sparse.csr_array) -> sparse.csr_arra
 
 
 def _parts(
-    system: System, place: SensorLayout, sensor: int, limit: float, oversampling: int
+    system: System, place: SensorLayout, sensor: int, limit: float, cells: int
 ) -> list[tuple[Part, sparse.csr_array]]:
     """With, for each, the (n, n_valid) means that make it; at most about ``limit`` sub-apertures in all."""
     if place.n_valid <= limit:
-        return [(Part(sensor, place, oversampling), sparse.csr_array(sparse.eye_array(place.n_valid)))]
+        return [(Part(sensor, place, cells), sparse.csr_array(sparse.eye_array(place.n_valid)))]
     across = 2
     # blocks lie about the centre of the pupil, as their sensor's grid does
     while len(place.mask) % across % 2 or len(_blocks(place, across)) > _IN_BLOCKS * limit:
@@ -143,12 +141,12 @@ def _parts(
     single = np.sort(patch[close[: int(limit) - (len(blocks) - n_single)]])
     whole = [blocks[i] for i in sorted(nearest[n_single:])]
     picked = sparse.csr_array((np.ones(len(single)), (np.arange(len(single)), single)), (len(single), place.n_valid))
-    out = [(Part(sensor, _subset(place, single), oversampling), picked)]
+    out = [(Part(sensor, _subset(place, single), cells), picked)]
     if whole:
         light = [place.illumination[block] / place.illumination[block].sum() for block in whole]
         rows = np.repeat(np.arange(len(whole)), across**2)
         means = sparse.csr_array((np.concatenate(light), (rows, np.concatenate(whole))), (len(whole), place.n_valid))
-        out.append((Part(sensor, _coarse(place, whole, across), max(1, oversampling // across)), means))
+        out.append((Part(sensor, _coarse(place, whole, across), cells), means))
     return out
 
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,8 +13,8 @@ from scipy import sparse
 
 from srtomo_core.layout import Layout
 from srtomo_core.system import System
-from srtomo_srtc.atmosphere import Profile
-from srtomo_srtc.covariance import Sightline, Turbulence, slope_tiles
+from srtomo_srtc.atmosphere import CovarianceTable, Profile
+from srtomo_srtc.covariance import Sightline, Turbulence, slope_cross_covariance, slope_tiles
 from srtomo_srtc.model import noise_covariance
 from srtomo_srtc.sampling import Sampling
 from srtomo_srtc.wind import carried
@@ -20,7 +22,7 @@ from srtomo_srtc.wind import carried
 Array = NDArray[np.float64]
 Single = NDArray[np.float32]
 
-_DIFFERENCE = 0.05  # of the logarithm of the outer scale, either way, for the derivative
+_REACH = 8.0  # m: tables are made for multiples of it, so that what differs a little shares one
 
 
 class SkyModel:
@@ -36,6 +38,7 @@ class SkyModel:
         sampling: which slopes.
         heights: (n_layers,) along the line of sight, m.
         noise: N_w of each sensor that takes part, (n, n).
+        whole_noise: the same, sparse, with what is on the blind modes.
         noisy: index of each of these sensors.
     """
 
@@ -47,30 +50,29 @@ class SkyModel:
         self._grids = [
             (weight, sampling.sightlines(system, profile, coarser)) for weight, coarser in ((4 / 3, 1), (-1 / 3, 2))
         ]
+        nodes = [line.nodes for _, lines in self._grids for line in lines]
+        self._reach = float(np.hypot(*(np.ptp(np.hstack(p), axis=1) for p in zip(*((n.x, n.y) for n in nodes)))).max())
         whole = noise_covariance(system, layout, 1.0)
         self.noisy = tuple(int(w) for w in np.unique(sampling.sensors))
-        self.noise: list[Single] = []
+        self.whole_noise: list[sparse.csr_array] = []
         for w in self.noisy:
             own = np.zeros(layout.n_slopes)
             own[layout.slopes_of(w)] = 1
             only = sparse.diags_array(own)
-            self.noise.append(self._projected(sampling.reduced(sparse.csr_array(only @ whole @ only))))
+            T = sampling.reduction
+            self.whole_noise.append(sparse.csr_array(T @ only @ whole @ only @ T.T).astype(np.float32))
+        self.noise = [self.seen(noise.toarray()) for noise in self.whole_noise]
 
     def __len__(self) -> int:
         return len(self.sampling)
 
     def layer(self, index: int, outer_scale: float) -> Single:
         """B_l: (n, n) rad^2 for a strength of 1."""
-        return self._projected(self._covariance(np.ones(1), outer_scale, slice(index, index + 1)))
+        return self._covariance(np.ones(1), outer_scale, slice(index, index + 1))
 
     def turbulence(self, strengths: Array, outer_scale: float) -> Single:
         """sum_l c_l B_l, (n, n) rad^2."""
-        return self._projected(self._covariance(strengths, outer_scale, slice(None)))
-
-    def by_log_outer_scale(self, strengths: Array, outer_scale: float) -> Single:
-        """Its derivative to the logarithm of the outer scale, (n, n)."""
-        above, below = (self.turbulence(strengths, outer_scale * np.exp(s * _DIFFERENCE)) for s in (1, -1))
-        return np.asarray((above - below) / np.float32(2 * _DIFFERENCE))
+        return self._covariance(strengths, outer_scale, slice(None))
 
     def lagged(
         self, strengths: Array, outer_scale: float, velocity: Array, time: float, layers: slice = slice(None)
@@ -82,11 +84,12 @@ class SkyModel:
             velocity: (n_layers, 2) where each of them goes, m/s.
             layers: that take part.
         """
-        n = len(self)
         # without extrapolation: correlations are asked for, and the missing part hardly shows in these
-        lines = [line.only(layers) for line in self._grids[0][1]]
-        both = [*lines, *(_moved(line, velocity, time) for line in lines)]
-        return self._projected(self._slopes(strengths, outer_scale, both)[n:, :n].T)
+        now = [line.only(layers) for line in self._grids[0][1]]
+        then = [_moved(line, velocity, time) for line in now]
+        reach = self._reach + time * float(np.hypot(*velocity.T).max())
+        turbulence = Turbulence(np.asarray(strengths, np.float64), _table(outer_scale, reach))
+        return self.seen(slope_cross_covariance(turbulence, now, then))
 
     def unseen(self, gamma: float) -> Single:
         """``gamma (I - P)``, (n, n), on the blind modes, where model and measurement are then the same."""
@@ -103,25 +106,35 @@ class SkyModel:
         if mean is not None:
             own = self.sampling.reduction @ mean
             reduced += np.outer(own, own)
-        return self._projected(reduced)
+        return self.seen(reduced)
 
-    def _covariance(self, strengths: Array, outer_scale: float, layers: slice) -> Array:
+    def _covariance(self, strengths: Array, outer_scale: float, layers: slice) -> Single:
         out = np.zeros((len(self), len(self)))
         for weight, lines in self._grids:
             out += weight * self._slopes(strengths, outer_scale, [line.only(layers) for line in lines])
-        return out
+        return self.seen(out)
 
     def _slopes(self, strengths: Array, outer_scale: float, lines: Sequence[Sightline]) -> Single:
-        profile = Profile(1.0, outer_scale, self.heights, np.asarray(strengths, np.float64))
-        turbulence = Turbulence.covering(profile, [line.nodes for line in lines])
+        turbulence = Turbulence(np.asarray(strengths, np.float64), _table(outer_scale, self._reach))
         return np.asarray(slope_tiles(turbulence, lines, fast=True).dense(), np.float32)
 
-    def _projected(self, matrix: NDArray[np.floating]) -> Single:
+    def seen(self, matrix: NDArray[np.floating]) -> Single:
+        """``P matrix P``, (n, n): without the blind modes."""
         blind = self.sampling.blind
         out = np.array(matrix, np.float64)
         out -= blind @ (blind.T @ out)
         out -= (out @ blind) @ blind.T
         return out.astype(np.float32)
+
+
+def _table(outer_scale: float, reach: float) -> CovarianceTable:
+    """For r0 = 1 m, at least up to a separation (m)."""
+    return _table_of(outer_scale, _REACH * math.ceil(reach / _REACH))
+
+
+@lru_cache(maxsize=4)
+def _table_of(outer_scale: float, reach: float) -> CovarianceTable:
+    return CovarianceTable.build(1.0, outer_scale, reach)
 
 
 def _moved(line: Sightline, velocity: Array, time: float) -> Sightline:

@@ -288,7 +288,7 @@ def test_400_nights_are_calibrated(system: System) -> None:
 
 def test_lagged_covariances_are_those_of_layers_carried_by_the_wind(system: System) -> None:
     layout = Layout(system)
-    sampling = Sampling.of(system, layout, 2000, 1)
+    sampling = Sampling.of(system, layout, 2000, 2)
     profile = Profile(1.0, 25.0, ALTITUDES * system.airmass, np.array([0.5, 0.3, 0.2]))
     model = SkyModel(system, layout, sampling, profile.heights)
     lines = sightlines(system, layout, profile, 1)
@@ -306,7 +306,7 @@ def test_lagged_covariances_are_those_of_layers_carried_by_the_wind(system: Syst
 
 def test_how_many_independent_frames_there_are(system: System) -> None:
     layout = Layout(system)
-    model = SkyModel(system, layout, Sampling.of(system, layout, 2000, 1), ALTITUDES * system.airmass)
+    model = SkyModel(system, layout, Sampling.of(system, layout, 2000, 8), ALTITUDES * system.airmass)
     strengths = np.array([10.0, 5.0, 5.0])
     turbulence = model.turbulence(strengths, 25.0)
     C = turbulence + sum(model.noise) + model.unseen(1e-12)
@@ -338,7 +338,7 @@ def test_blocks_of_sub_apertures_are_modelled_as_large_ones() -> None:
     assert len({part.place.size for part in sampling.parts}) == 2
     profile = Profile(0.2, 30.0, np.array([0.0, 9000.0]), np.array([0.6, 0.4]))
     both = []
-    for lines in (sampling.sightlines(gnao, profile), sightlines(gnao, layout, profile, 4)):
+    for lines in (sampling.sightlines(gnao, profile), sightlines(gnao, layout, profile, 8)):
         both.append(slope_tiles(Turbulence.covering(profile, [s.nodes for s in lines]), lines, fast=True).dense())
     mean = sampling.reduced(both[1])
     assert np.abs(both[0] - mean).max() < 0.01 * np.abs(mean).max()
