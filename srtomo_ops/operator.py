@@ -11,9 +11,11 @@ from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from msgs_schema.msg import HrtcStatus, RecorderStatus, SimStatus
 from msgs_schema.srv import ChangeSky, PublishReconstructor, SwapReconstructor
+from rcl_interfaces.srv import GetParameters, SetParameters
 from rclpy.client import Client
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
+from rclpy.parameter import Parameter, parameter_value_to_python
 from rclpy.qos import QoSProfile
 from std_srvs.srv import SetBool, Trigger
 
@@ -174,6 +176,31 @@ class Operator(Node):
         response = self.call(Trigger, "hrtc/flat", Trigger.Request())
         if not response.success:
             raise OperatorError(f"hrtc/flat: {response.message}")
+
+    def change_parameters(self, words: Mapping[str, str]) -> None:
+        """Change parameters of the HRTC while it runs; values as text, in the parameter's own unit.
+
+        Raises:
+            OperatorError: no such parameter, not a value of its type, or refused.
+        """
+        names = list(words)
+        found = self.call(GetParameters, "hrtc/get_parameters", GetParameters.Request(names=names)).values
+        parameters = []
+        for i, name in enumerate(names):
+            value = parameter_value_to_python(found[i]) if len(found) == len(names) else None
+            if value is None:
+                raise OperatorError(f"{name}: the HRTC has no such parameter")
+            kind, word = type(value), words[name]
+            if kind is bool and word not in ("true", "false"):
+                raise OperatorError(f"{name}: expected true or false, got {word}")
+            try:
+                parameters.append(Parameter(name, value=word == "true" if kind is bool else kind(word)))
+            except ValueError:
+                raise OperatorError(f"{name}: expected {kind.__name__}, got {word}") from None
+        request = SetParameters.Request(parameters=[parameter.to_parameter_msg() for parameter in parameters])
+        for name, result in zip(names, self.call(SetParameters, "hrtc/set_parameters", request).results, strict=True):
+            if not result.successful:
+                raise OperatorError(f"{name}: {result.reason}")
 
     def start_sim(self) -> None:
         """Let the simulated plant publish its first frame.

@@ -22,6 +22,7 @@ EXAMPLE = """examples:
   srtomo ctl commit 0123456789abcdef 0123...   id and SHA-256, in hex, as 'srtomo ctl publish' printed them
   srtomo ctl close                          close the loop
   srtomo ctl flat                           open it, and put the static shape on at once
+  srtomo ctl set slew_limit=1e-7 gain_ramp=50    parameters of the HRTC, in their own units (m; frames)
   srtomo ctl sky --set 'atmosphere.r0=10 cm' --over 10s    change the simulated plant while it runs
   srtomo ctl dither gnao_ltao_sr --rms 5nm --over 30s      for 'srtomo register': shakes the mirrors, then flat
   srtomo ctl status"""
@@ -29,7 +30,7 @@ EXAMPLE = """examples:
 _PATIENCE = 10.0  # s to find a node: one that was just started takes some seconds
 
 _ACTIONS = (
-    "status", "configure", "activate", "deactivate", "cleanup", "close", "open", "flat", "start-sim", "publish",
+    "status", "configure", "activate", "deactivate", "cleanup", "close", "open", "flat", "set", "start-sim", "publish",
     "commit", "roll-back", "sky", "dither",
 )  # fmt: skip
 
@@ -38,7 +39,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
     """Arguments of the command."""
     parser.add_argument("action", choices=_ACTIONS, metavar="ACTION", help=", ".join(_ACTIONS))
     parser.add_argument(
-        "words", metavar="WORD", nargs="*", help="publish: LABEL; commit, roll-back: ID SHA256 (hex); dither: SYSTEM"
+        "words",
+        metavar="WORD",
+        nargs="*",
+        help="publish: LABEL; commit, roll-back: ID SHA256 (hex); dither: SYSTEM; set: NAME=VALUE ...",
     )
     parser.add_argument("--namespace", default="", help="of the instrument (default: none)")
     parser.add_argument(
@@ -68,7 +72,8 @@ def main(options: argparse.Namespace) -> int:
     expected = {"publish": "LABEL", "commit": "ID SHA256", "roll-back": "ID SHA256", "dither": "SYSTEM"}.get(
         options.action, ""
     )
-    if len(options.words) != len(expected.split()):
+    values = _values(options.words) if options.action == "set" else {}
+    if not values and len(options.words) != len(expected.split()):
         raise ValueError(
             f"{options.action}: expected {expected or 'nothing'} after it, got {' '.join(options.words) or 'nothing'}"
         )
@@ -92,6 +97,8 @@ def main(options: argparse.Namespace) -> int:
             operator.close_loop(options.action == "close")
         elif options.action == "flat":
             operator.flatten()
+        elif options.action == "set":
+            operator.change_parameters(values)
         elif options.action == "start-sim":
             operator.start_sim()
         elif options.action == "publish":
@@ -115,6 +122,13 @@ def main(options: argparse.Namespace) -> int:
         print("done")
     write_json(options.json, numbers)
     return 0
+
+
+def _values(words: list[str]) -> dict[str, str]:
+    for word in words or [""]:
+        if "=" not in word:
+            raise ValueError(f"set: expected NAME=VALUE, got {word or 'nothing'}")
+    return {name: value for name, _, value in (word.partition("=") for word in words)}
 
 
 def _changes(options: argparse.Namespace) -> dict[str, str]:

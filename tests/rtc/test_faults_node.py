@@ -27,9 +27,7 @@ from lifecycle_msgs.srv import ChangeState
 from msgs_schema.msg import DmCommand, HrtcEvent, SlopeFrame
 from msgs_schema.msg import Reconstructor as ReconstructorMsg
 from msgs_schema.msg import ReconstructorBlock as ReconstructorBlockMsg
-from rcl_interfaces.srv import SetParameters
 from rclpy.node import Node
-from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
 
 from srtomo_ops.operator import Operator, OperatorError
@@ -214,12 +212,6 @@ class Wire:
         self.operator.destroy_node()
 
 
-def set_parameters(loop: Wire, **values: float) -> None:
-    changes = [Parameter(name, value=value).to_parameter_msg() for name, value in values.items()]
-    response = loop.operator.call(SetParameters, "hrtc/set_parameters", SetParameters.Request(parameters=changes))
-    assert all(result.successful for result in response.results)
-
-
 @pytest.fixture(scope="module")
 def matrix_file(tmp_path_factory, mini):
     path = tmp_path_factory.mktemp("faults") / "g.npz"
@@ -346,7 +338,7 @@ def test_sensors_that_fall_silent_for_good(loop):
     """The watchdog opens the loop and leaves the mirror flat; what comes of the frame after that is late."""
     since, k = len(loop.events), loop.next
     before = loop.status().loop_opened_by_silence
-    set_parameters(loop, watchdog=0.5)
+    loop.operator.change_parameters({"watchdog": "0.5"})
     assert np.abs(loop.commands[-1].commands).max() > 0
     parts = loop.messages(k)
     loop.send(*parts[:2])
@@ -358,7 +350,16 @@ def test_sensors_that_fall_silent_for_good(loop):
     with loop.counting(dropped_late=2):
         loop.send(*parts[2:])
         assert loop.run(2) == [Verdict.OPEN] * 2
-    set_parameters(loop, watchdog=10.0)
+    loop.operator.change_parameters({"watchdog": "10", "polc": "true", "gain_ramp": "0"})
+    for name, value in (
+        ("watchdog", "-1"),
+        ("watchdog", "soon"),
+        ("polc", "1"),
+        ("watchdogs", "1"),
+        ("kernel", "int16"),
+    ):
+        with pytest.raises(OperatorError, match=name):
+            loop.operator.change_parameters({name: value})
 
 
 def test_a_manual_flat(loop):

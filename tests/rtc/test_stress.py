@@ -41,7 +41,8 @@ class Hands:
         self.known.insert(0, (identity, sha256))
 
     def do_something(self) -> None:
-        acts = (self.swap, self.swap, self.set, self.shape, self.loop, self.publish, self.rest)
+        acts = (self.swap, self.swap, self.set, self.limit, self.shape, self.loop, self.operator.flatten)
+        acts += (self.publish, self.rest)
         self.chance.choice(acts)()
         self.operator.spin(self.chance.random() * 0.03)
 
@@ -51,7 +52,15 @@ class Hands:
         self.known.reverse()
 
     def set(self) -> None:
-        values = {"leak": self.chance.random() * 0.1, "polc": self.chance.random() < 0.9}
+        self._set({"leak": self.chance.random() * 0.1, "polc": self.chance.random() < 0.9})
+
+    def limit(self) -> None:
+        chance = self.chance
+        limits = {"slew_limit": 1e-7, "rms_limit": 5e-7, "watchdog": 0.5}
+        values: dict[str, float | int] = {name: chance.random() * most for name, most in limits.items()}
+        self._set({"gain_ramp": chance.randrange(100), **values, **dict.fromkeys(chance.sample(list(limits), 1), 0.0)})
+
+    def _set(self, values: dict[str, float | int]) -> None:
         parameters = [Parameter(name, value=value).to_parameter_msg() for name, value in values.items()]
         self.operator.call(SetParameters, "hrtc/set_parameters", SetParameters.Request(parameters=parameters))
 
