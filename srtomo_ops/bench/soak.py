@@ -36,7 +36,7 @@ FLAT_BYTES = 8 << 20
 _CONTRAST = 5.0  # in TOLERANCEs: the least by which a mixture of two reconstructors has to stand out
 _SAMPLE_PERIOD = 0.5  # s
 _LEAST_SAMPLES = 16
-_FILLED = 20_000  # frames after which several reconstructors have come and gone, and queues are full
+_FILLED = 100_000  # frames after which several reconstructors have come and gone, and queues are full
 _WARM = 0.25  # of the run, left out where memory is looked at
 _NODES = ("hrtc", "recorder", "sensors")
 
