@@ -24,8 +24,8 @@ from srtomo_srtc.parallel import run
 from srtomo_srtc.reconstructors import implicit
 
 TOLERANCE = 0.05
-"""Of the residual on random slopes. Float32 leaves some 4e-3, which costs less than 0.01 nm of wavefront error; a wrong
-entry leaves about 1."""
+"""Of the residual on random slopes. Float32 and tables leave up to 1e-2, which costs less than 0.01 nm of wavefront
+error; a wrong entry leaves about 1."""
 
 _GEMM = 2048
 _PAIRS = 2  # of slopes of each sensor on which the result is checked
