@@ -108,7 +108,7 @@ def make(bag: Path, folder: Path) -> None:
             operator.commit(identity, sha256)
 
         nodes.start("hrtc", ["hrtc", "mini", "-p", f"interaction_matrix:={folder / 'interaction_matrix.npz'}"])
-        nodes.start("srtc", ["srtc", "mini", "-p", "priors:=[ground,file]"])
+        nodes.start("srtc", ["srtc", "mini", "-p", "priors:=[ground,file]", "-p", "closures:=none"])
         topics = [topic.name for topic in TOPICS]
         nodes.start("recorder", ["record", "mini", "-o", str(bag), "--topics", *topics])
         operator.transition("configure")

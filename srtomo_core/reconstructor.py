@@ -6,7 +6,8 @@ that were on the mirror during them::
     u[k] = (1-g) u[k-1] + g sum_j ( R_j (y[k-j] - y_ref) + Q_j u~[k-j] ),     Q_j = R_j G
 
 R_0 alone has the wrong gain: with more than one exposure, a whole reconstructor for the newest one alone comes along,
-the fallback for when the loop does not have the others.
+the fallback for when the loop does not have the others. So may :class:`Closure` and :class:`LowOrder`, for when sensors
+are closed.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import hashlib
 import json
 import os
 import zipfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -62,19 +63,69 @@ class Block:
     rows: Floats
 
 
-def n_parts(n_epochs: int) -> int:
-    """Pairs of R and Q of a reconstructor: one an epoch and, with more than one, the fallback's."""
-    return n_epochs + (n_epochs > 1)
+@dataclass(frozen=True, eq=False)
+class Closure:
+    """A whole reconstructor, for one exposure, for when some sensors are closed: a laser that was shut or tripped.
+
+    Attributes:
+        sensors: bit w set: sensor w is closed.
+        R: (n_commands, n_slopes) m/rad; columns of closed sensors are 0.
+        Q: (n_commands, n_commands) R G.
+    """
+
+    sensors: int
+    R: Floats
+    Q: Floats
 
 
-def block_table(n_commands: int, n_epochs: int) -> list[tuple[int, int, int, int]]:
+@dataclass(frozen=True, eq=False)
+class LowOrder:
+    """Tip-tilt, and what else natural stars answer for, from their slopes alone.
+
+    For when no reconstructor is there for the sensors that are closed. It acts as an integrator, ``u[k] = u[k-1] + g
+    commands^T slopes (y - y_ref)``, which leaves everything else as it was.
+
+    Attributes:
+        commands: (n_modes, n_commands) m; each a shape.
+        slopes: (n_modes, n_slopes) 1/rad; 0 for sensors that it does without.
+    """
+
+    commands: Floats
+    slopes: Floats
+
+    @classmethod
+    def from_rows(cls, commands: ArrayLike, slopes: ArrayLike, n_commands: int, n_slopes: int) -> LowOrder | None:
+        """From both, row after row, as they travel; None if they are empty.
+
+        Raises:
+            ReconstructorError: no whole rows.
+        """
+        flat = _frozen(commands).ravel(), _frozen(slopes).ravel()
+        if not any(map(len, flat)):
+            return None
+        if len(flat[0]) * n_slopes != len(flat[1]) * n_commands or len(flat[0]) % n_commands:
+            raise ReconstructorError(f"low_order: expected modes of {n_commands} commands and of {n_slopes} slopes")
+        return cls(flat[0].reshape(-1, n_commands), flat[1].reshape(-1, n_slopes))
+
+    @property
+    def R(self) -> Floats:
+        """(n_commands, n_slopes) m/rad."""
+        return self.commands.T @ self.slopes
+
+
+def n_parts(n_epochs: int, n_closures: int = 0) -> int:
+    """Pairs of R and Q of a reconstructor: one an epoch; with more than one, the fallback's; one a closure."""
+    return n_epochs + (n_epochs > 1) + n_closures
+
+
+def block_table(n_commands: int, n_epochs: int, n_closures: int = 0) -> list[tuple[int, int, int, int]]:
     """The blocks that a reconstructor travels in: (epoch, matrix, first_row, n_rows), by block index.
 
-    The fallback, if there is one, travels as epoch ``n_epochs``.
+    The fallback, if there is one, travels as epoch ``n_epochs``, closures as those after it.
     """
     return [
         (epoch, matrix, first, min(_ROWS_PER_BLOCK, n_commands - first))
-        for epoch in range(n_parts(n_epochs))
+        for epoch in range(n_parts(n_epochs, n_closures))
         for matrix in (0, 1)
         for first in range(0, n_commands, _ROWS_PER_BLOCK)
     ]
@@ -97,6 +148,8 @@ class Reconstructor:
         provenance: what made it, from what; JSON values; not part of the identity.
         fallback_R, fallback_Q: (n_commands, n_slopes) m/rad and (n_commands, n_commands), for the newest exposure
             alone; with several epochs, and only then.
+        closures: each for another set of sensors that are closed.
+        low_order: for when others are, or None.
     """
 
     fingerprint: bytes
@@ -111,6 +164,8 @@ class Reconstructor:
     provenance: Mapping[str, Any] = field(default_factory=dict)
     fallback_R: Floats | None = None
     fallback_Q: Floats | None = None
+    closures: tuple[Closure, ...] = ()
+    low_order: LowOrder | None = None
 
     def __post_init__(self) -> None:
         for name in ("R", "Q", "slope_reference", "command_limit", "probe_commands", "probe_slopes"):
@@ -136,6 +191,16 @@ class Reconstructor:
                 object.__setattr__(self, name, _frozen(value))
                 if value.shape != shape:
                     raise ReconstructorError(f"{name}: expected shape {shape}, got {value.shape}")
+        closures = tuple(Closure(int(c.sensors), _frozen(c.R), _frozen(c.Q)) for c in self.closures)
+        object.__setattr__(self, "closures", closures)
+        for closure in closures:
+            if (closure.R.shape, closure.Q.shape) != ((commands, slopes), (commands, commands)):
+                raise ReconstructorError(f"closures: expected shapes {(commands, slopes)} and {(commands, commands)}")
+        if self.low_order is not None:
+            low = LowOrder(_frozen(self.low_order.commands), _frozen(self.low_order.slopes))
+            object.__setattr__(self, "low_order", low)
+            if (low.commands.shape, low.slopes.shape) != ((len(low.commands), commands), (len(low.commands), slopes)):
+                raise ReconstructorError(f"low_order: expected modes of {commands} commands and of {slopes} slopes")
         if len(self.fingerprint) != 32:
             raise ReconstructorError(f"fingerprint: expected 32 bytes, got {len(self.fingerprint)}")
 
@@ -152,6 +217,8 @@ class Reconstructor:
         label: str = "",
         provenance: Mapping[str, Any] | None = None,
         fallback: ArrayLike | None = None,
+        closures: Mapping[int, ArrayLike] | None = None,
+        low_order: LowOrder | None = None,
         threads: int = 1,
     ) -> Reconstructor:
         """A reconstructor from R and the interaction matrix G (n_slopes, n_commands).
@@ -160,6 +227,7 @@ class Reconstructor:
 
         Args:
             R: (n_commands, n_slopes), or (n_epochs, n_commands, n_slopes) with a ``fallback`` (n_commands, n_slopes).
+            closures: R (n_commands, n_slopes) by the bits of the sensors that are closed.
             threads: to form Q with, apart from those of the BLAS library.
         """
         applied = np.asarray(R, dtype=np.float32)
@@ -169,6 +237,7 @@ class Reconstructor:
             raise ReconstructorError(f"G: expected shape {applied.shape[:0:-1]}, got {model.shape}")
         n_commands, n_slopes = applied.shape[1:]
         alone = None if fallback is None else np.asarray(fallback, dtype=np.float32)
+        without = {sensors: np.asarray(part, dtype=np.float32) for sensors, part in (closures or {}).items()}
         # any fixed vectors do: they only have to excite every row of Q
         probes = np.random.default_rng(0).standard_normal((_PROBES, n_commands)).astype(np.float32) * np.float32(1e-7)
         return cls(
@@ -184,23 +253,33 @@ class Reconstructor:
             provenance=dict(provenance or {}),
             fallback_R=alone,
             fallback_Q=None if alone is None else _frozen(_product(alone, model, threads)),
+            closures=tuple(
+                Closure(sensors, part, _frozen(_product(part, model, threads))) for sensors, part in without.items()
+            ),
+            low_order=low_order,
         )
 
     @classmethod
-    def from_parts(cls, n_epochs: int, R: Floats, Q: Floats, **fields: Any) -> Reconstructor:
-        """From R (n_parts, n_commands, n_slopes) and Q in the order of :attr:`parts`; ``fields`` are all others."""
+    def from_parts(
+        cls, n_epochs: int, R: Floats, Q: Floats, *, closed: Sequence[int] = (), **fields: Any
+    ) -> Reconstructor:
+        """From R (n_parts, n_commands, n_slopes) and Q in the order of :attr:`parts`; ``fields`` are all others.
+
+        Args:
+            closed: the sensors of each closure, as its bits.
+        """
         fallback = {} if n_epochs == 1 else {"fallback_R": R[n_epochs], "fallback_Q": Q[n_epochs]}
-        return cls(R=R[:n_epochs], Q=Q[:n_epochs], **fallback, **fields)
+        first = n_parts(n_epochs)
+        closures = tuple(Closure(sensors, R[first + i], Q[first + i]) for i, sensors in enumerate(closed))
+        return cls(R=R[:n_epochs], Q=Q[:n_epochs], closures=closures, **fallback, **fields)
 
     @property
     def parts(self) -> list[tuple[Floats, Floats]]:
-        """R and Q of each epoch, then the fallback's if there is one; views, not copies."""
+        """R and Q of each epoch, the fallback's if there is one, and each closure's; views, not copies."""
         pairs = list(zip(self.R, self.Q, strict=True))
-        return (
-            pairs
-            if self.fallback_R is None or self.fallback_Q is None
-            else [*pairs, (self.fallback_R, self.fallback_Q)]
-        )
+        if self.fallback_R is not None and self.fallback_Q is not None:
+            pairs.append((self.fallback_R, self.fallback_Q))
+        return [*pairs, *((closure.R, closure.Q) for closure in self.closures)]
 
     @property
     def n_epochs(self) -> int:
@@ -219,13 +298,18 @@ class Reconstructor:
 
     @cached_property
     def sha256(self) -> bytes:
-        """Digest of all that decides a command: fingerprint, shapes, gain, limits, reference, R, Q and the fallback."""
+        """Digest of all that decides a command: fingerprint, shapes, gain, limits, reference, every R and Q, closures'
+        sensors, the low order."""
         digest = hashlib.sha256(_FORMAT.encode())
         digest.update(self.fingerprint)
         digest.update(np.array(self.R.shape, dtype="<u4").tobytes())
         digest.update(np.array([self.gain], dtype="<f4").tobytes())
         for array in (self.slope_reference, self.command_limit, self.R, self.Q, *sum(self.parts[self.n_epochs :], ())):
             digest.update(array.data)
+        digest.update(np.array([closure.sensors for closure in self.closures], dtype="<u4").tobytes())
+        if self.low_order is not None:
+            digest.update(self.low_order.commands.data)
+            digest.update(self.low_order.slopes.data)
         return digest.digest()
 
     @property
@@ -236,7 +320,9 @@ class Reconstructor:
     def blocks(self) -> Iterator[Block]:
         """The rows in the order of :func:`block_table`; views, not copies."""
         parts = self.parts
-        for index, (epoch, matrix, first, rows) in enumerate(block_table(self.n_commands, self.n_epochs)):
+        for index, (epoch, matrix, first, rows) in enumerate(
+            block_table(self.n_commands, self.n_epochs, len(self.closures))
+        ):
             yield Block(index, epoch, matrix, first, parts[epoch][matrix][first : first + rows])
 
     def save(self, path: str | Path, interaction_matrix: ArrayLike | None = None) -> None:
@@ -244,6 +330,14 @@ class Reconstructor:
         extra = {} if interaction_matrix is None else {"G": np.asarray(interaction_matrix, dtype=np.float32)}
         if self.fallback_R is not None and self.fallback_Q is not None:
             extra |= {"fallback_R": self.fallback_R, "fallback_Q": self.fallback_Q}
+        if self.closures:
+            extra |= {
+                "closed": np.array([closure.sensors for closure in self.closures], np.uint32),
+                "closed_R": np.stack([closure.R for closure in self.closures]),
+                "closed_Q": np.stack([closure.Q for closure in self.closures]),
+            }
+        if self.low_order is not None:
+            extra |= {"low_order_commands": self.low_order.commands, "low_order_slopes": self.low_order.slopes}
         header = {
             "format": _FORMAT,
             "sha256": self.sha256.hex(),
@@ -273,6 +367,10 @@ class Reconstructor:
         """
         header, arrays = read_npz(path, _FORMAT)
         try:
+            closed = [arrays[name] for name in ("closed", "closed_R", "closed_Q")] if "closed" in arrays else [()] * 3
+            low_order = None
+            if "low_order_commands" in arrays:
+                low_order = LowOrder(arrays["low_order_commands"], arrays["low_order_slopes"])
             reconstructor = cls(
                 fingerprint=bytes.fromhex(header["fingerprint"]),
                 gain=header["gain"],
@@ -281,6 +379,8 @@ class Reconstructor:
                 **{name: arrays[name] for name in ("R", "Q", "slope_reference", "command_limit",
                                                    "probe_commands", "probe_slopes")},
                 **{name: arrays[name] for name in ("fallback_R", "fallback_Q") if name in arrays},
+                closures=tuple(Closure(*each) for each in zip(*closed, strict=True)),
+                low_order=low_order,
             )  # fmt: skip
             expected = header["sha256"]
         except (KeyError, TypeError) as error:

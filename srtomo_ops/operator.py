@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any
 
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from msgs_schema.msg import HrtcStatus, RecorderStatus, SimStatus
-from msgs_schema.srv import ChangeSky, PublishReconstructor, SwapReconstructor
+from msgs_schema.srv import ChangeSky, CloseSensor, PublishReconstructor, SwapReconstructor
 from rcl_interfaces.srv import GetParameters, SetParameters
 from rclpy.client import Client
 from rclpy.executors import SingleThreadedExecutor
@@ -201,6 +201,18 @@ class Operator(Node):
         for name, result in zip(names, self.call(SetParameters, "hrtc/set_parameters", request).results, strict=True):
             if not result.successful:
                 raise OperatorError(f"{name}: {result.reason}")
+
+    def close_sensors(self, sensors: Sequence[str], closed: bool) -> tuple[int, str]:
+        """Take sensors, by name, out of the commands or put them back: the first frame, and what makes commands then.
+
+        Raises:
+            OperatorError: refused.
+        """
+        request = CloseSensor.Request(sensors=list(sensors), closed=closed)
+        response = self.call(CloseSensor, "hrtc/close_sensor", request)
+        if not response.success:
+            raise OperatorError(f"hrtc/close_sensor: {response.message}")
+        return int(response.first_frame), str(response.message)
 
     def start_sim(self) -> None:
         """Let the simulated plant publish its first frame.

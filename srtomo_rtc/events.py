@@ -66,7 +66,8 @@ def event_fields(
         fields |= {"reconstructor": slot.id, "sha256": list(slot.sha256), "kernel": slot.kernel_name}
         settings = program.settings
     if settings is not None:
-        fields |= {"settings": settings.id} | {name: getattr(settings, name) for name in SCALARS}
+        fields |= {"settings": settings.id, "closed_sensors": settings.closed_sensors}
+        fields |= {name: getattr(settings, name) for name in SCALARS}
     if program is not None and kind in PROGRAM_KINDS:
         fields |= {
             "offset": _floats(program.settings.offset),

@@ -43,6 +43,7 @@ class Counters:
     held_missing: int = 0
     held_behind: int = 0
     held_history: int = 0
+    held_closed: int = 0
     dropped_duplicate: int = 0
     dropped_late: int = 0
     dropped_session: int = 0

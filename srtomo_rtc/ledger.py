@@ -52,6 +52,14 @@ class FrameSet:
     def __len__(self) -> int:
         return sum(self._ends) - sum(self._starts)
 
+    @classmethod
+    def of(cls, first: int, last: int) -> FrameSet:
+        """The numbers from ``first`` to ``last``."""
+        run = cls()
+        if first <= last:
+            run._starts, run._ends = [first], [last + 1]
+        return run
+
     @property
     def first(self) -> int:
         """The lowest number. The set must not be empty."""
@@ -72,6 +80,16 @@ class FrameSet:
             first = max(first, end)
         if first <= last:
             yield first, last
+
+    def __or__(self, other: FrameSet) -> FrameSet:
+        either = FrameSet()
+        for start, end in sorted(zip(self._starts + other._starts, self._ends + other._ends)):
+            if either._ends and start <= either._ends[-1]:
+                either._ends[-1] = max(either._ends[-1], end)
+            else:
+                either._starts.append(start)
+                either._ends.append(end)
+        return either
 
     def __and__(self, other: FrameSet) -> FrameSet:
         common = FrameSet()
@@ -104,6 +122,7 @@ class _Session:
     commands: FrameSet = field(default_factory=FrameSet)
     last_answer: int = -1  # highest number of a command that answers slopes, or their absence
     adopted: list[int] = field(default_factory=list)  # first frames that the HRTC said it would answer
+    closed: list[tuple[int, int]] = field(default_factory=list)  # first frame, and the bits of sensors closed from then
     last_arrival: float = 0.0
 
     def complete(self, n_subapertures: int) -> FrameSet:
@@ -111,8 +130,17 @@ class _Session:
         if sum(stream.n_subapertures for stream in self.slopes) != n_subapertures:
             return FrameSet()
         frames = self.commands
-        for have in self.slopes.values():
-            frames = frames & have
+        for stream, have in self.slopes.items():
+            frames = frames & (have | self.excused(stream, frames.last if len(frames) else -1))
+        return frames
+
+    def excused(self, stream: _Stream, last: int) -> FrameSet:
+        """Frames up to ``last`` in which the stream's sensor was closed, and need not have sent anything."""
+        frames = FrameSet()
+        events = sorted(self.closed)
+        for (first, sensors), (after, _) in zip(events, [*events[1:], (last + 1, 0)]):
+            if sensors >> stream.sensor & 1:
+                frames = frames | FrameSet.of(first, min(after - 1, last))
         return frames
 
     def gaps(self, in_flight: int, quiet: bool) -> tuple[dict[_Stream, list[tuple[int, int]]], list[tuple[int, int]]]:
@@ -124,14 +152,16 @@ class _Session:
         if not self.slopes:
             return {}, []
         firsts = [have.first for have in self.slopes.values()]
-        lasts = [have.last for have in self.slopes.values()]
+        newest = max(have.last for have in self.slopes.values())
+        there = {stream: have | self.excused(stream, newest) for stream, have in self.slopes.items()}
+        lasts = [have.last for have in there.values()]
         if self.last_answer >= 0:
             lasts.append(self.last_answer)
         partial_start = 0 < min(firsts) and max(firsts) - min(firsts) <= in_flight
         first = max(firsts) if partial_start else min(firsts)
         partial_end = not quiet and max(lasts) - min(lasts) <= in_flight
         last = min(lasts) if partial_end else max(lasts)
-        return {s: list(have.gaps(first, last)) for s, have in self.slopes.items()}, self._unanswered(first, last)
+        return {s: list(have.gaps(first, last)) for s, have in there.items()}, self._unanswered(first, last)
 
     def _unanswered(self, first: int, last: int) -> list[tuple[int, int]]:
         adopted = sorted(self.adopted)
@@ -222,6 +252,12 @@ class Ledger:
     def add_adoption(self, session: int, first_frame: int) -> None:
         """Book that the HRTC adopted a session, and the first frame that it answers."""
         self._session(session).adopted.append(first_frame)
+
+    def add_closed(self, session: int, first_frame: int, sensors: int) -> None:
+        """Book that from a frame on these sensors (bits) are closed, and no others."""
+        closed = self._session(session).closed
+        if (closed[-1][1] if closed else 0) != sensors:
+            closed.append((first_frame, sensors))
 
     def _gaps(self, session: _Session) -> tuple[dict[_Stream, list[tuple[int, int]]], list[tuple[int, int]]]:
         by_stream, unanswered = session.gaps(self._in_flight, self._clock() - session.last_arrival > _QUIET)

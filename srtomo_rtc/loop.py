@@ -19,6 +19,11 @@ What limits a command acts in this order, and the state follows what was put on 
 command whose rms over all actuators is too large is scaled down, its shape kept; the slew limit. After closing the gain
 may rise in a ramp: in frame j of N (from 1) ``j g / N`` stands for every g above.
 
+Sensors that are closed are not waited for, and whatever they send is ignored. The command is then made by the
+reconstructor's :class:`~srtomo_core.reconstructor.Closure` for just these; or, if there is none, the natural stars'
+:class:`~srtomo_core.reconstructor.LowOrder` acts as an integrator and leaves the high orders as they are; or the
+command is held. The state and the history of what was on the mirror go on, so that no change among these shows a step.
+
 Tip-tilt may have a loop of its own, on stars that count their own frames j (:class:`srtomo_core.system.TipTiltLoop`)::
 
     t[j] = keep t[j-1] + g_t R_t (y_t[j] - y_ref),        m[k] = clip(u[k] + o + t)
@@ -48,7 +53,7 @@ import enum
 import itertools
 import math
 import weakref
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -56,7 +61,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from srtomo_core.layout import Layout
-from srtomo_core.reconstructor import Reconstructor
+from srtomo_core.reconstructor import Reconstructor, n_parts
 from srtomo_rtc import native
 from srtomo_rtc.crew import Crew
 from srtomo_rtc.lowrank import Factors
@@ -82,6 +87,7 @@ class Verdict(enum.IntEnum):
     HOLD_MISSING = 4
     HOLD_BEHIND = 5
     HOLD_HISTORY = 6
+    HOLD_CLOSED = 7
 
 
 class LoopState(enum.IntEnum):
@@ -110,6 +116,7 @@ class Settings:
         offset: (n_commands,) m of wavefront.
         tip_tilt_gain, tip_tilt_leak: of tip-tilt's own loop, per frame of its own, where there is one.
         slope_reference: (n_slopes,) rad; ``-G offset`` for a wanted static shape, 0 for an aberration to be corrected.
+        closed_sensors: bit w set: sensor w is closed.
     """
 
     id: int
@@ -126,6 +133,7 @@ class Settings:
     watchdog: float = 0.0
     tip_tilt_gain: float = 0.0
     tip_tilt_leak: float = 0.0
+    closed_sensors: int = 0
 
     def __post_init__(self) -> None:
         # as they travel in events: a replay must compute with the same numbers
@@ -140,6 +148,7 @@ class Matrices:
     """R and Q for one exposure, in tiles (:func:`srtomo_rtc.vmm.tiled`).
 
     Attributes:
+        sensors: bit w set: sensor w is used; of the others there are no columns in the tiles.
         R_tiles: of each sensor, its columns sub-aperture by sub-aperture: x, then y; 16-bit integers for kernel int16;
             none for kernel tlr.
         R_scales: of each sensor, (n_rows of the tiles,) what its integers are in m/rad; None but for kernel int16.
@@ -147,14 +156,18 @@ class Matrices:
         Q_tiles: its columns command by command.
     """
 
-    def __init__(self, layout: Layout, kernel: str = "float32") -> None:
+    def __init__(self, layout: Layout, kernel: str = "float32", sensors: int = -1) -> None:
         n_rows = rows_of(layout.n_commands)
         kind: type = np.int16 if kernel == "int16" else np.float32
         self._n_commands = layout.n_commands
-        tiled_sensors = layout.sensors if kernel != "tlr" else ()
-        self.R_tiles = tuple(huge_zeros(tiles_shape(layout.n_commands, s.n_slopes, kind), kind) for s in tiled_sensors)
+        self._counts = tuple(sensor.n_slopes for sensor in layout.sensors)
+        self.sensors = sensors & (1 << len(self._counts)) - 1
+        in_tiles = self.sensors if kernel != "tlr" else 0
+        self.R_tiles = tuple(
+            huge_zeros(tiles_shape(layout.n_commands, n if in_tiles >> w & 1 else 0, kind), kind)
+            for w, n in enumerate(self._counts)
+        )
         self.factors: Factors | None = None
-        self._n_slopes = layout.n_slopes
         self.R_scales = tuple(np.ones(n_rows, np.float32) for _ in layout.sensors) if kernel == "int16" else None
         self.Q_tiles = huge_zeros(tiles_shape(layout.n_commands, layout.n_commands, np.float32), np.float32)
 
@@ -165,26 +178,33 @@ class Matrices:
             ValueError: R cannot be held in 16 bits.
         """
         self.factors = factors
-        start = 0
-        for w, tiles in enumerate(self.R_tiles):
-            n = tiles.shape[1]
-            own: NDArray[Any] = R[:, start : start + n].reshape(len(R), 2, -1).transpose(0, 2, 1).reshape(len(R), n)
+        for w, columns in self._used() if factors is None else ():
+            n, tiles = self._counts[w], self.R_tiles[w]
+            own: NDArray[Any] = R[:, columns].reshape(len(R), 2, -1).transpose(0, 2, 1).reshape(len(R), n)
             if self.R_scales is not None:
                 own, self.R_scales[w][: len(R)] = quantise(own)
             tiled(own, tiles)
-            start += n
         tiled(Q, self.Q_tiles)
+
+    def _used(self) -> Iterator[tuple[int, slice]]:
+        """The sensors that are used, each with its columns of R."""
+        start = 0
+        for w, n in enumerate(self._counts):
+            if self.sensors >> w & 1:
+                yield w, slice(start, start + n)
+            start += n
 
     @property
     def R(self) -> Floats:
         """(n_commands, n_slopes) as it is applied, a copy."""
         if self.factors is not None:
             return self.factors.applied()
-        m, own = self._n_commands, []
-        for w, tiles in enumerate(self.R_tiles):
-            matrix = untiled(tiles, m) * (1 if self.R_scales is None else self.R_scales[w][:m, None])
-            own.append(matrix.reshape(m, -1, 2).transpose(0, 2, 1).reshape(m, -1))
-        return np.concatenate(own, axis=1)
+        m = self._n_commands
+        R = np.zeros((m, sum(self._counts)), np.float32)
+        for w, columns in self._used():
+            matrix = untiled(self.R_tiles[w], m) * (1 if self.R_scales is None else self.R_scales[w][:m, None])
+            R[:, columns] = matrix.reshape(m, -1, 2).transpose(0, 2, 1).reshape(m, -1)
+        return R
 
     @property
     def Q(self) -> Floats:
@@ -197,12 +217,10 @@ class Matrices:
             return self.factors.times(slopes)
         out = np.zeros(rows_of(self._n_commands), np.float32)
         part = np.empty_like(out)
-        start = 0
-        for w, tiles in enumerate(self.R_tiles):
-            own = slopes[start : start + tiles.shape[1]]
-            multiply(tiles, np.ascontiguousarray(own.reshape(2, -1).T).ravel(), part)
+        for w, columns in self._used():
+            own = slopes[columns]
+            multiply(self.R_tiles[w], np.ascontiguousarray(own.reshape(2, -1).T).ravel(), part)
             out += part if self.R_scales is None else part * self.R_scales[w]
-            start += len(own)
         return out
 
     @property
@@ -212,7 +230,7 @@ class Matrices:
 
     def warm(self) -> None:
         """Touch every byte."""
-        self.times(np.zeros(self._n_slopes, np.float32))
+        self.times(np.zeros(sum(self._counts), np.float32))
         multiply(self.Q_tiles, np.zeros(self._n_commands, np.float32), np.empty(rows_of(self._n_commands), np.float32))
 
     def native(self) -> native.Matrices:
@@ -243,6 +261,11 @@ def star_weights(layout: Layout, R: Floats) -> Floats:
     return (lengths / total if total else lengths).astype(np.float32)
 
 
+def used_by(R: Floats, layout: Layout) -> int:
+    """Bit w set: R (n_commands, n_slopes) uses sensor w."""
+    return sum(1 << w for w in range(len(layout.sensors)) if R[:, layout.slopes_of(w)].any())
+
+
 class Slot:
     """Memory for one reconstructor. Made once, filled off the loop.
 
@@ -252,6 +275,9 @@ class Slot:
         n_epochs: of the reconstructor in it.
         epochs: matrices of each epoch that there is room for, the newest exposure first.
         fallback: for the newest exposure alone; the first epoch's where there is room for no more.
+        closures: for the newest exposure alone, by the sensors that are closed. Their room is made when it is needed
+            first, and kept.
+        low_order: of natural stars, or None.
         star_weights: (n_sensors,) :func:`star_weights` of it.
     """
 
@@ -262,6 +288,8 @@ class Slot:
         self.n_epochs = 1
         self.epochs = tuple(Matrices(layout, kernel) for _ in range(max_epochs))
         self.fallback = Matrices(layout, kernel) if max_epochs > 1 else self.epochs[0]
+        self.closures: dict[int, Matrices] = {}
+        self.low_order: Matrices | None = None
         self.slope_reference = np.zeros(layout.n_slopes, np.float32)
         self.command_limit = np.zeros(m, np.float32)
         self.star_weights = np.zeros(len(layout.sensors), np.float32)
@@ -274,7 +302,7 @@ class Slot:
         """Copy a checked reconstructor in. Not on the loop's thread, and never into a slot in use.
 
         Args:
-            factors: of each of its parts, for kernel tlr.
+            factors: of each of its epochs and of its fallback, for kernel tlr.
 
         Raises:
             ValueError: it has more epochs than there is room for, or cannot be held in 16 bits.
@@ -282,14 +310,16 @@ class Slot:
         if reconstructor.n_epochs > len(self.epochs):
             raise ValueError(f"uses {reconstructor.n_epochs} exposures; there is room for {len(self.epochs)}")
         self.n_epochs = reconstructor.n_epochs
-        targets = (*self.epochs[: self.n_epochs], self.fallback)
-        each: Sequence[Factors | None] = factors or [None] * len(reconstructor.parts)
-        for matrices, (R, Q), own in zip(targets, reconstructor.parts, each, strict=False):
+        parts = reconstructor.parts[: n_parts(self.n_epochs)]
+        targets = (*self.epochs[: self.n_epochs], self.fallback)[: len(parts)]
+        each: Sequence[Factors | None] = factors or [None] * len(parts)
+        for matrices, (R, Q), own in zip(targets, parts, each, strict=True):
             matrices.fill(R, Q, own)
         self.kernel_name = "-".join([KERNELS[self.kernel], *(own.digest().hex()[:16] for own in factors)])
+        self._fill_closures(reconstructor)
         self.slope_reference[:] = reconstructor.slope_reference
         self.command_limit[:] = reconstructor.command_limit
-        self.star_weights[:] = star_weights(self._layout, reconstructor.parts[-1][0])
+        self.star_weights[:] = star_weights(self._layout, parts[-1][0])
         self.gain = reconstructor.gain
         self.sha256 = reconstructor.sha256
         self.id = reconstructor.id
@@ -301,6 +331,19 @@ class Slot:
             stars[own] = slope_reference[own].reshape(2, -1).T.ravel()
             high[own] = 0
         return high, stars
+
+    def _fill_closures(self, reconstructor: Reconstructor) -> None:
+        kernel = "float32" if self.kernel == "tlr" else self.kernel
+        room, self.closures = self.closures, {}
+        for closure in reconstructor.closures:
+            matrices = room.get(closure.sensors) or Matrices(self._layout, kernel, ~closure.sensors)
+            matrices.fill(closure.R, closure.Q)
+            self.closures[closure.sensors] = matrices
+        self.low_order = None
+        if reconstructor.low_order is not None:
+            R = reconstructor.low_order.R
+            self.low_order = Matrices(self._layout, kernel, used_by(R, self._layout))
+            self.low_order.fill(R, np.zeros_like(reconstructor.Q[0]))
 
 
 _tokens = itertools.count(1)
@@ -319,15 +362,29 @@ class Program:
     Attributes:
         token: names it in the frame path.
         native: the frame path's; the slot's memory and this object's.
+        acts: what makes the commands, for people.
     """
 
     def __init__(self, slot: Slot, settings: Settings) -> None:
         self.slot = slot
         self.settings = settings
         self.token = next(_tokens)
-        several = slot.n_epochs > 1
-        alone = slot.fallback if several else slot.epochs[0]
         epochs = slot.epochs[: slot.n_epochs]
+        alone = slot.fallback if slot.n_epochs > 1 else epochs[0]
+        closed, polc, keep, held = settings.closed_sensors, settings.polc, 1.0 - settings.leak, False
+        self.acts = "all sensors"
+        if closed in slot.closures:
+            self.acts = "the reconstructor without these"
+            alone = slot.closures[closed]
+            epochs = (alone,)
+        elif closed and slot.low_order is not None and not slot.low_order.sensors & closed:
+            self.acts = "natural stars' low orders, while high orders are held"
+            alone = slot.low_order
+            epochs, polc, keep = (alone,), False, 1.0
+        elif closed:
+            self.acts = "nothing: they are held"
+            epochs, held = (alone,), True
+        sensors = alone.sensors & ~closed
         whole_reference = settings.slope_reference + slot.slope_reference
         slope_reference, star_reference = slot.divided(whole_reference)
         alone_reference = alone.times(slope_reference)
@@ -336,7 +393,6 @@ class Program:
         for part in epochs:
             reference += part.times(slope_reference)
         limit = np.minimum(slot.command_limit, np.float32(settings.command_limit))
-        keep = 1.0 - settings.leak
         self._matrices = {alone, *epochs}
         self._held = (
             _padded(settings.offset, n_rows),
@@ -354,10 +410,12 @@ class Program:
             settings.id,
             settings.fault_budget,
             len(epochs),
-            settings.polc,
+            polc,
+            sensors,
+            held,
             settings.gain_ramp,
             slot.gain,
-            keep * (1.0 - slot.gain) if settings.polc else keep,
+            keep * (1.0 - slot.gain) if polc else keep,
             settings.relaxation,
             keep,
             settings.slew_limit or math.inf,
@@ -484,8 +542,14 @@ class Loop:
 
     @property
     def used(self) -> int:
-        """The sensors that had come when the last frame was answered, and those of tip-tilt's own that it took in."""
+        """The sensors that had come when the last frame was answered, closed ones left out, and those of tip-tilt's own
+        that it took in."""
         return int(self._c.used)
+
+    @property
+    def wanted(self) -> int:
+        """The sensors that the next frame is made from."""
+        return int(self._c.wanted)
 
     @property
     def closed(self) -> bool:
@@ -652,7 +716,10 @@ class Loop:
         lib.srt_loop_prepare(self._pointer)
 
     def add(self, sensor: int, slopes: Floats) -> None:
-        """Take the slopes (n_slopes_w,) of one of the high orders' sensors and form their product; they are copied."""
+        """Take the slopes (n_slopes_w,) of one of the high orders' sensors and form their product; they are copied.
+
+        Those of a closed sensor are ignored.
+        """
         if not self.all_sensors >> sensor & 1:
             raise ValueError(f"sensor {sensor}: its star is one of tip-tilt's own loop")
         values = np.ascontiguousarray(slopes, np.float32)
@@ -673,8 +740,8 @@ class Loop:
         lib.srt_tip_tilt_give(self._pointer, frame, sensors & self._c.tip_tilt.sensors, values.ctypes.data)
 
     def answer(self, mirror_frame: int, mirror_frame_before: int, mirror_fraction: float) -> Verdict:
-        """Answer a frame whose sensors were all added; the arguments are SlopeFrame's."""
-        assert self.sensors == self.all_sensors
+        """Answer a frame whose sensors were all added, closed ones or not; the arguments are SlopeFrame's."""
+        assert self.sensors == self.wanted
         return Verdict(lib.srt_loop_answer(self._pointer, mirror_frame, mirror_frame_before, mirror_fraction))
 
     def hold(self, verdict: Verdict) -> Verdict:

@@ -31,7 +31,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from msgs_schema.msg import HrtcEvent, HrtcState, HrtcStatus
 from msgs_schema.msg import Reconstructor as ReconstructorMsg
 from msgs_schema.msg import ReconstructorBlock as ReconstructorBlockMsg
-from msgs_schema.srv import PublishReconstructor, SetStaticShape, SwapReconstructor
+from msgs_schema.srv import CloseSensor, PublishReconstructor, SetStaticShape, SwapReconstructor
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
 from rclpy.clock import Clock, ClockType
 from rclpy.executors import SingleThreadedExecutor
@@ -54,7 +54,7 @@ from srtomo_rtc.hrtc import Hrtc, Snapshot
 from srtomo_rtc.latency import LatencyHistogram
 from srtomo_rtc.loop import MAX_EPOCHS, LoopState, Program, Settings
 from srtomo_rtc.offload import Offload, tilt_of_commands
-from srtomo_rtc.swap import Manifest, Refused, Swap
+from srtomo_rtc.swap import MAX_CLOSURES, Manifest, Refused, Swap
 from srtomo_rtc.vmm import KERNELS, instructions
 
 _ADOPTION_TIMEOUT = 2.0  # s for the loop to take up what was posted: it does between two frames, or at once if idle
@@ -95,6 +95,11 @@ _PARAMETERS: tuple[tuple[str, Any, ParameterDescriptor], ...] = (
         "max_epochs",
         1,
         _integer("exposures that a reconstructor may use; n above 1 take n+1 times the memory", 1, MAX_EPOCHS, True),
+    ),
+    (
+        "max_closures",
+        MAX_CLOSURES,
+        _integer("sets of closed sensors that a reconstructor may have R and Q for, in memory", 0, 255, True),
     ),
     ("frame_path", "compiled", _read_only("how slopes come in and commands go out: compiled, or rclpy")),
     (
@@ -149,6 +154,7 @@ class HrtcNode(LifecycleNode):
         self.create_service(SwapReconstructor, "hrtc/commit", self._commit)
         self.create_service(SwapReconstructor, "hrtc/roll_back", self._roll_back)
         self.create_service(SetStaticShape, "hrtc/static_shape", self._static_shape)
+        self.create_service(CloseSensor, "hrtc/close_sensor", self._close_sensor)
         self._resend = self.create_client(PublishReconstructor, "srtc/publish")
         self.create_subscription(
             ReconstructorMsg, wire.RECONSTRUCTOR.name, self._on_manifest, QoSProfile(**wire.RECONSTRUCTOR.qos())
@@ -257,7 +263,9 @@ class HrtcNode(LifecycleNode):
             self._cores = [int(word) for word in self._value("cores").split(",") if word]
         except ValueError:
             raise ValueError(f"parameter cores: expected numbers as 2,3, got {self._value('cores')}") from None
-        swap = Swap(system, layout, G_cal, settings, self._post, self._value("max_epochs"), kernel)
+        swap = Swap(
+            system, layout, G_cal, settings, self._post, self._value("max_epochs"), kernel, self._value("max_closures")
+        )
         loop = system.loop
         deadline = self._value("deadline") or max(loop.delay - 1, 0.1) / loop.rate
         for name, known in (("frame_path", ("compiled", "rclpy")), ("waiting", ("auto", "blocking", "polling"))):
@@ -459,6 +467,9 @@ class HrtcNode(LifecycleNode):
             probe_commands=np.array(message.probe_commands, np.float32),
             probe_slopes=np.array(message.probe_slopes, np.float32),
             label=message.label,
+            closed_sensors=tuple(message.closed_sensors),
+            low_order_commands=np.array(message.low_order_commands, np.float32),
+            low_order_slopes=np.array(message.low_order_slopes, np.float32),
         )
         if message.id != self._manifest.id:
             self._refuse(self._manifest, "id is not the first 8 bytes of sha256")
@@ -638,6 +649,35 @@ class HrtcNode(LifecycleNode):
             response.success, response.first_frame, response.message = self._adopted(program, "static shape")
         return response
 
+    def _close_sensor(self, request: CloseSensor.Request, response: CloseSensor.Response) -> CloseSensor.Response:
+        swap = self._swap
+        if swap is None:
+            response.message = "the HRTC is not configured"
+            return response
+        names = [sensor.name for sensor in self._layout.sensors]
+        response.closed_sensors = swap.settings.closed_sensors
+        if not request.sensors or not set(request.sensors) <= set(names):
+            response.message = f"sensors: expected some of {', '.join(names)}, got {', '.join(request.sensors)}"
+            return response
+        those = sum(1 << names.index(name) for name in set(request.sensors))
+        closed = swap.settings.closed_sensors | those if request.closed else swap.settings.closed_sensors & ~those
+        program = self._worker.submit(lambda: swap.change_settings(closed_sensors=closed)).result()
+        response.closed_sensors = closed
+        text = f"sensors closed: {', '.join(self._closed_names()) or 'none'}"
+        if program is None:
+            response.success, response.message = True, f"{text}; taken up with the first reconstructor"
+            self._event(EventKind.SETTINGS, text)
+        else:
+            text += f"; commands are made by {program.acts}"
+            self._kinds[id(program)] = (EventKind.SETTINGS, text)
+            response.success, response.first_frame, response.message = self._adopted(program, text)
+        return response
+
+    def _closed_names(self) -> list[str]:
+        assert self._swap is not None
+        closed = self._swap.settings.closed_sensors
+        return [sensor.name for w, sensor in enumerate(self._layout.sensors) if closed >> w & 1]
+
     def _adopted(self, program: Program, what: str) -> tuple[bool, int, str]:
         """Wait until the loop runs ``program``: (success, first frame, message)."""
         hrtc = self._hrtc
@@ -748,6 +788,7 @@ class HrtcNode(LifecycleNode):
             message.loop_state = int(loop.loop_state)
             message.loop_opened_by_faults = loop.opened_by_faults
             message.loop_opened_by_silence = loop.opened_by_silence
+            message.closed_sensors = swap.settings.closed_sensors
             for name in ("active", "staged", "previous"):
                 held = getattr(swap, name)
                 setattr(message, "reconstructor" if name == "active" else name, held.slot.id if held else 0)
@@ -807,6 +848,8 @@ class HrtcNode(LifecycleNode):
             return DiagnosticStatus.OK, "waiting for slopes"
         if silent:
             return DiagnosticStatus.WARN, silent
+        if closed := self._closed_names():
+            return DiagnosticStatus.WARN, f"{state}; sensors closed: {', '.join(closed)}"
         starless = self._tip_tilt_silence(hrtc)
         if self._layout.tip_tilt_sensors and starless > _SILENT_STARS:
             return DiagnosticStatus.WARN, f"{state}; no slopes of tip-tilt's own stars for {starless:.1f} s: it is held"

@@ -69,6 +69,7 @@ _REMEMBERED = 10  # queues' worth of messages, which may come by both
 _QUIET = 0.25  # s without a message in the ring after which the subscriptions are looked at too
 _RING_CHANNELS = (SLOPES, COMMAND)
 _RING, _SUBSCRIPTION = 0, 1  # ways by which these come
+_SAYS_WHAT_IS_CLOSED = (HrtcEvent.SESSION, HrtcEvent.SETTINGS, HrtcEvent.COMMIT, HrtcEvent.ROLLBACK)
 
 
 _UNRECORDED = "a publisher offers less than reliable (or transient local) delivery, and is not recorded"
@@ -316,6 +317,8 @@ class Recorder:
             event = deserialize_message(record.data, HrtcEvent)
             if event.kind == HrtcEvent.SESSION:
                 self.ledger.add_adoption(event.session, event.first_frame)
+            if event.session and event.kind in _SAYS_WHAT_IS_CLOSED:
+                self.ledger.add_closed(event.session, event.first_frame, event.closed_sensors)
 
     def _publish_status(self) -> None:
         publishers = {}

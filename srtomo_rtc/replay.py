@@ -19,7 +19,7 @@ from srtomo_core import wire
 from srtomo_core.bag import BagError, BagMessage, BagReader
 from srtomo_core.exposure import Exposure, fits, subaperture_starts
 from srtomo_core.layout import Layout
-from srtomo_core.reconstructor import Reconstructor, ReconstructorError, block_table, n_parts
+from srtomo_core.reconstructor import LowOrder, Reconstructor, ReconstructorError, block_table, n_parts
 from srtomo_core.system import System
 from srtomo_rtc.events import PROGRAM_KINDS, SCALARS, EventKind
 from srtomo_rtc.loop import MAX_EPOCHS, Loop, LoopState, Program, Settings, Slot, Verdict
@@ -139,10 +139,11 @@ class Replay:
             ) and 1 <= message.n_epochs <= MAX_EPOCHS:
                 manifests[bytes(message.sha256)] = message
         columns = (self.layout.n_slopes, self.layout.n_commands)
-        tables = {sha256: set(block_table(columns[1], message.n_epochs)) for sha256, message in manifests.items()}
+        sizes = {sha256: (message.n_epochs, len(message.closed_sensors)) for sha256, message in manifests.items()}
+        tables = {sha256: set(block_table(columns[1], *size)) for sha256, size in sizes.items()}
         matrices = {
-            sha256: [np.full((n_parts(message.n_epochs), columns[1], n), np.nan, np.float32) for n in columns]
-            for sha256, message in manifests.items()
+            sha256: [np.full((n_parts(*size), columns[1], n), np.nan, np.float32) for n in columns]
+            for sha256, size in sizes.items()
         }
         for recorded in self._of(wire.RECONSTRUCTOR_BLOCK):
             try:
@@ -166,6 +167,8 @@ class Replay:
                     command_limit=message.command_limit,
                     probe_commands=message.probe_commands.reshape(-1, self.layout.n_commands),
                     probe_slopes=message.probe_slopes.reshape(-1, self.layout.n_slopes),
+                    closed=message.closed_sensors.tolist(),
+                    low_order=LowOrder.from_rows(message.low_order_commands, message.low_order_slopes, *columns[::-1]),
                 )
             except (ReconstructorError, ValueError):
                 continue  # the HRTC refused it
@@ -199,6 +202,7 @@ class Replay:
                 id=event.settings,
                 offset=np.array(event.offset, np.float32),
                 slope_reference=np.array(event.slope_reference, np.float32),
+                closed_sensors=event.closed_sensors,
                 **{name: getattr(event, name) for name in SCALARS},
             ),
         )
@@ -380,7 +384,8 @@ class _Session:
             exposure, command = self._past.get(earlier, (None, None))
             if command is None:
                 return None
-            if command.verdict != Verdict.OK:
+            everyone = self._loop.all_sensors
+            if command.verdict != Verdict.OK or command.sensors & everyone != everyone:
                 break
             if exposure is None or exposure.arrived != self._loop.all_sensors:
                 return None
@@ -495,7 +500,7 @@ class _Session:
             loop.flatten()
         elif command.verdict in _TIMED:
             loop.hold(Verdict(command.verdict))
-        elif exposure is not None and exposure.arrived == loop.all_sensors:
+        elif exposure is not None and exposure.arrived & loop.wanted == loop.wanted:
             for sensor, own in enumerate(exposure.slopes):
                 if loop.all_sensors >> sensor & 1:
                     loop.add(sensor, own)

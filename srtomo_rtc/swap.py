@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -21,11 +21,11 @@ from numpy.typing import NDArray
 from scipy.sparse.linalg import ArpackError, eigs
 
 from srtomo_core.layout import Layout
-from srtomo_core.reconstructor import Reconstructor, ReconstructorError, block_table, n_parts
+from srtomo_core.reconstructor import LowOrder, Reconstructor, ReconstructorError, block_table, n_parts
 from srtomo_core.system import System
 from srtomo_core.wire import ReconstructorBlock
 from srtomo_rtc.compression import LIMIT, error_to_noise, int16_to_noise
-from srtomo_rtc.loop import Matrices, Program, Settings, Slot, star_weights
+from srtomo_rtc.loop import Matrices, Program, Settings, Slot, star_weights, used_by
 from srtomo_rtc.lowrank import Factors, factorise
 
 Floats = NDArray[np.float32]
@@ -40,9 +40,13 @@ A wrong sign or scale is refused. In slopes, not in commands: with several mirro
 others that look the same to the sensors.
 """
 
+MAX_CLOSURES = 8
+"""Sets of closed sensors that a reconstructor may have R and Q for, unless a parameter says otherwise."""
+
 _SMOOTH_SHAPES = 20
 _ANGLES = 4  # a half circle and an epoch after the first
 _PROBE_TOLERANCE = 1e-3
+_LOW_ORDER_MARGIN = 1.5
 
 
 class Refused(ValueError):
@@ -65,6 +69,9 @@ class Manifest:
     probe_commands: Floats
     probe_slopes: Floats
     label: str = ""
+    closed_sensors: tuple[int, ...] = ()
+    low_order_commands: Floats = field(default_factory=lambda: np.zeros(0, np.float32))
+    low_order_slopes: Floats = field(default_factory=lambda: np.zeros(0, np.float32))
 
     @property
     def id(self) -> int:
@@ -77,9 +84,9 @@ class Check:
     """The numbers of a passed check.
 
     Attributes:
-        stability: :func:`stability`, of the fallback too: the larger one.
+        stability: :func:`stability`, of the fallback and the closures too: the largest one.
         scale: range of ``w.(G_cal R w) / w.w`` for the slopes w of smooth shapes, R summed over the epochs, and of the
-            fallback's; NaN where no mirror is seen.
+            fallback's and closures'; NaN where no mirror is seen.
         unseen: names of mirrors that no sensor sees, whose sign and scale nothing here can tell.
         compression: what a kernel that does not hold R in float32 makes of it; empty: nothing.
     """
@@ -180,12 +187,20 @@ def smooth_shapes(layout: Layout, tip_tilt: bool, focus: bool = True, mirror: in
     return shapes
 
 
-def check(reconstructor: Reconstructor, layout: Layout, G_cal: Floats, tip_tilt: bool, focus: bool = True) -> Check:
+def check(
+    reconstructor: Reconstructor,
+    layout: Layout,
+    G_cal: Floats,
+    tip_tilt: bool,
+    focus: bool = True,
+    delay: float = 1.0,
+) -> Check:
     """Check a whole reconstructor against the instrument's calibrated interaction matrix.
 
     Args:
         G_cal: (n_slopes, n_commands), rad/m; 0 for mirrors that no sensor sees (multi-object correction in open loop).
         tip_tilt, focus: whether some sensor sees these overall.
+        delay: of the loop, frames; what is left as an integrator (the low order) is not stable at every one.
 
     Raises:
         Refused: with the reason.
@@ -204,10 +219,11 @@ def check(reconstructor: Reconstructor, layout: Layout, G_cal: Floats, tip_tilt:
         values = getattr(reconstructor, name)
         if values is not None and not np.isfinite(values).all():
             raise Refused(f"{name}: holds values that are not finite")
+    _check_closures(reconstructor, layout)
     if not (reconstructor.command_limit > 0).all():
         raise Refused("command_limit: expected every limit above 0")
     if layout.tip_tilt_sensors:
-        for R, _ in (reconstructor.parts[0], reconstructor.parts[-1]):
+        for R, _ in (reconstructor.parts[0], reconstructor.parts[n_parts(reconstructor.n_epochs) - 1]):
             _check_tip_tilt(R, layout, G_cal)
         # from here on the high orders': their Q is of the slopes that their loop has
         G_cal = G_cal.copy()
@@ -216,12 +232,11 @@ def check(reconstructor: Reconstructor, layout: Layout, G_cal: Floats, tip_tilt:
     seen = [bool(G_cal[:, layout.commands_of(i)].any()) for i in range(len(layout.mirrors))]
     _check_probes(reconstructor, layout, seen)
 
-    mismatch = np.stack([Q - R @ G_cal for R, Q in reconstructor.parts]).astype(np.float64)
-    sums = [reconstructor.R.sum(axis=0)]
-    stabilities = [stability(mismatch[: reconstructor.n_epochs])]
-    if reconstructor.fallback_R is not None:
-        sums.append(reconstructor.fallback_R)
-        stabilities.append(stability(mismatch[reconstructor.n_epochs :]))
+    n = reconstructor.n_epochs
+    alone = reconstructor.parts[n:]
+    sums = [reconstructor.R.sum(axis=0), *(R for R, _ in alone)]
+    groups = [reconstructor.parts[:n], *([part] for part in alone)]
+    stabilities = [stability(np.stack([Q - R @ G_cal for R, Q in group]).astype(np.float64)) for group in groups]
     low = high = math.nan
     if any(seen):
         shapes = [smooth_shapes(layout, tip_tilt, focus, mirror) for mirror, some in enumerate(seen) if some]
@@ -238,6 +253,8 @@ def check(reconstructor: Reconstructor, layout: Layout, G_cal: Floats, tip_tilt:
         raise Refused(
             f"not stable enough: spectral radius of Q - R G_cal is {max(stabilities):.3f}, limit {STABILITY_LIMIT:g}"
         )
+    if reconstructor.low_order is not None:
+        _check_low_order(reconstructor.low_order, reconstructor.gain, G_cal, delay)
     unseen = tuple(mirror.name for mirror, some in zip(layout.mirrors, seen, strict=True) if not some)
     return Check(max(stabilities), (low, high), unseen)
 
@@ -287,6 +304,33 @@ def _check_probes(reconstructor: Reconstructor, layout: Layout, seen: list[bool]
             raise Refused(f"Q is not R G: they differ by {error / scale if scale else math.inf:.2g} on probes")
 
 
+def _check_closures(reconstructor: Reconstructor, layout: Layout) -> None:
+    """Each is for another set of sensors, and does without them."""
+    all_sensors = (1 << len(layout.sensors)) - 1
+    masks = [closure.sensors for closure in reconstructor.closures]
+    if len(set(masks)) < len(masks) or not all(0 < mask < all_sensors for mask in masks):
+        raise Refused(f"closed_sensors: expected distinct sets of some sensors, got {masks}")
+    for closure in reconstructor.closures:
+        if not (np.isfinite(closure.R).all() and np.isfinite(closure.Q).all()):
+            raise Refused("closures: hold values that are not finite")
+        if used_by(closure.R, layout) & closure.sensors:
+            raise Refused(f"closures: the one for sensors {closure.sensors:#b} uses some of them")
+
+
+def _check_low_order(low_order: LowOrder, gain: float, G_cal: Floats, delay: float) -> None:
+    """The integrator is stable with a gain half as large again: all roots of ``z^n - z^(n-1) + 1.5 g e`` are inside the
+    unit circle, for each eigenvalue e of what the modes look like to the slopes that control them."""
+    if not (np.isfinite(low_order.commands).all() and np.isfinite(low_order.slopes).all()):
+        raise Refused("low_order: holds values that are not finite")
+    frames = math.ceil(delay)
+    for value in np.linalg.eigvals((low_order.slopes @ G_cal @ low_order.commands.T).astype(np.float64)):
+        polynomial = np.zeros(frames + 1, np.complex128)
+        polynomial[:2] = 1, -1
+        polynomial[-1] += _LOW_ORDER_MARGIN * gain * value
+        if not np.abs(np.roots(polynomial)).max() < 1:
+            raise Refused(f"low_order: an integrator of gain {gain:g} times {value:.2g} is not stable enough")
+
+
 class Swap:
     """Slots, the transfer under way, and what the loop is to run.
 
@@ -299,7 +343,9 @@ class Swap:
         max_epochs: exposures that a reconstructor may use: the loop's. Three slots and a transfer have room for so many
             and, with more than one, a fallback: ``4 (max_epochs + 1) n_commands (n_slopes + n_commands)`` floats.
         kernel: float32; int16, which holds R in half the memory; tlr, which holds it in tiles of low rank. Both refuse
-            what that would spoil, and tlr also what is no smaller than with int16.
+            what that would spoil, and tlr also what is no smaller than with int16. Closures it holds in float32.
+        max_closures: sets of closed sensors that a reconstructor may have R and Q for. Room for them, in three slots
+            and a transfer as above, is made when the first such reconstructor comes.
 
     Attributes:
         settings, active, staged, previous: what the loop is to run, and what may be committed or rolled back to.
@@ -318,6 +364,7 @@ class Swap:
         post: Callable[[Program], None],
         max_epochs: int = 1,
         kernel: str = "float32",
+        max_closures: int = MAX_CLOSURES,
     ) -> None:
         if G_cal.shape != (layout.n_slopes, layout.n_commands):
             raise ValueError(f"G_cal: expected shape {(layout.n_slopes, layout.n_commands)}, got {G_cal.shape}")
@@ -326,7 +373,7 @@ class Swap:
         self._G_cal = G_cal
         self._sees_tip_tilt, self._sees_focus = seen_low_orders(system, layout)
         self._post = post
-        self._max_epochs = max_epochs
+        self._max_epochs, self._max_closures = max_epochs, max_closures
         self._slots = [Slot(layout, max_epochs, kernel) for _ in range(3)]
         self.largest_matrix = max(slot.epochs[0].largest for slot in self._slots)
         self._manifest: Manifest | None = None
@@ -360,11 +407,17 @@ class Swap:
                 f"expected {layout.n_commands} commands x {layout.n_slopes} slopes, "
                 f"got {manifest.n_commands} x {manifest.n_slopes}"
             )
-        table = block_table(manifest.n_commands, manifest.n_epochs)
+        self._check_number(len(manifest.closed_sensors))
+        table = block_table(manifest.n_commands, manifest.n_epochs, len(manifest.closed_sensors))
         if manifest.n_blocks != len(table):
             raise Refused(f"expected {len(table)} blocks, got {manifest.n_blocks}")
         if len(manifest.probe_commands) % layout.n_commands or len(manifest.probe_slopes) % layout.n_slopes:
             raise Refused("probe_commands, probe_slopes: expected whole vectors")
+        self._low_order_of(manifest)
+        parts = n_parts(manifest.n_epochs, len(manifest.closed_sensors))
+        if parts > len(self._R):
+            self._R = np.zeros((parts, layout.n_commands, layout.n_slopes), np.float32)
+            self._Q = np.zeros((parts, layout.n_commands, layout.n_commands), np.float32)
         self._table = table
         self._waiting = frozenset(range(len(table)))
         self._manifest = manifest
@@ -421,6 +474,8 @@ class Swap:
                 probe_commands=manifest.probe_commands.reshape(-1, self._layout.n_commands),
                 probe_slopes=manifest.probe_slopes.reshape(-1, self._layout.n_slopes),
                 label=manifest.label,
+                closed=manifest.closed_sensors,
+                low_order=self._low_order_of(manifest),
             )
         except ReconstructorError as error:
             raise Refused(str(error)) from None
@@ -433,7 +488,15 @@ class Swap:
     def stage_whole(self, reconstructor: Reconstructor) -> Held:
         """As :meth:`stage`, for a reconstructor that is whole already (from a file)."""
         self._check_epochs(reconstructor.n_epochs)
-        result = check(reconstructor, self._layout, self._G_cal, self._sees_tip_tilt, self._sees_focus)
+        self._check_number(len(reconstructor.closures))
+        result = check(
+            reconstructor,
+            self._layout,
+            self._G_cal,
+            self._sees_tip_tilt,
+            self._sees_focus,
+            self._system.loop.delay,
+        )
         factors: list[Factors] = []
         if self._kernel == "int16":
             result = replace(result, compression=self._check_int16(reconstructor))
@@ -464,9 +527,27 @@ class Swap:
         if not 1 <= n_epochs <= self._max_epochs:
             raise Refused(f"uses {n_epochs} exposures; this loop takes {self._max_epochs} (parameter max_epochs)")
 
-    def _check_int16(self, reconstructor: Reconstructor) -> str:
+    def _low_order_of(self, manifest: Manifest) -> LowOrder | None:
+        rows = manifest.low_order_commands, manifest.low_order_slopes
         try:
-            ratio = max(int16_to_noise(self._system, self._layout, R) for R, _ in reconstructor.parts)
+            return LowOrder.from_rows(*rows, self._layout.n_commands, self._layout.n_slopes)
+        except ReconstructorError as error:
+            raise Refused(str(error)) from None
+
+    def _check_number(self, n_closures: int) -> None:
+        if n_closures > self._max_closures:
+            raise Refused(
+                f"has R and Q for {n_closures} sets of closed sensors; this loop takes {self._max_closures} "
+                "(parameter max_closures)"
+            )
+
+    def _check_int16(self, reconstructor: Reconstructor) -> str:
+        low_order = [] if reconstructor.low_order is None else [reconstructor.low_order.R]
+        try:
+            ratio = max(
+                int16_to_noise(self._system, self._layout, R)
+                for R in [*(R for R, _ in reconstructor.parts), *low_order]
+            )
         except ValueError as error:
             raise Refused(f"16 bits: {error}") from None
         if not ratio <= LIMIT:
@@ -483,7 +564,8 @@ class Swap:
             Refused: they err too much, make the loop unstable, or are no smaller than 16-bit integers.
         """
         found, shares, ratios = [], [], []
-        for R, _ in reconstructor.parts:
+        parts = reconstructor.parts[: n_parts(reconstructor.n_epochs)]
+        for R, _ in parts:
             try:
                 factors = factorise(self._system, self._layout, R)
             except ValueError as error:
@@ -501,7 +583,7 @@ class Swap:
                     "it takes kernel float32"
                 )
             found.append(factors)
-        applied = [Q - own.applied() @ self._G_cal for own, (_, Q) in zip(found, reconstructor.parts, strict=True)]
+        applied = [Q - own.applied() @ self._G_cal for own, (_, Q) in zip(found, parts, strict=True)]
         mismatch = np.stack(applied).astype(np.float64)
         n = reconstructor.n_epochs
         radius = max(stability(mismatch[:n]), stability(mismatch[n:]) if len(mismatch) > n else 0.0)
@@ -558,5 +640,7 @@ class Swap:
         if self.active is None:
             return None
         program = Program(self.active.slot, self.settings)
+        if "closed_sensors" in changes:
+            program.warm()
         self._post(program)
         return program

@@ -12,7 +12,7 @@ from srtomo_core.layout import Layout
 from srtomo_core.system import InstrumentError, System
 from srtomo_sim.course import Change, Course, alters_turbulence
 from srtomo_sim.mirror import DelayLine, OnMirror
-from srtomo_sim.shack_hartmann import measured_noise, noise_correlation, noise_sigma
+from srtomo_sim.shack_hartmann import dark_slopes, measured_noise, noise_correlation, noise_sigma
 from srtomo_sim.sky import Sky, WavefrontError
 from srtomo_sim.turbulence import Screens
 
@@ -103,6 +103,8 @@ class Plant:
             slopes[own] = factor @ white[own]
         own_noise = np.where(self._own, slopes, 0)
         slopes -= own_noise
+        dark = noise.dark
+        in_the_dark = slopes[dark]
         slopes += sky.turbulence(frame)
         slopes -= place.interaction @ self._line.shape(frame)
         for i, layout in enumerate(place.layout.sensors):
@@ -111,6 +113,7 @@ class Plant:
             mine = slopes[sky.layout.slopes_of(i)]
             mine[: layout.n_valid] += c * tilt[0] + s * tilt[1]
             mine[layout.n_valid :] += c * tilt[1] - s * tilt[0]
+        slopes[dark] = in_the_dark
         self._expose(frame, slopes, own_noise)
         if self._line.is_late(frame):
             self._late.add(frame)
@@ -229,10 +232,12 @@ class _Noise:
     Attributes:
         sigma: (n_slopes,) rad.
         correlated: slopes of a sensor whose spots are not round, and the correlation of x with y (n_valid,).
+        dark: slopes (indices) without light, which are noise alone.
     """
 
     sigma: NDArray[np.float32]
     correlated: list[tuple[slice, NDArray[np.float32]]]
+    dark: NDArray[np.intp]
 
     @classmethod
     def of(cls, system: System, layout: Layout) -> _Noise:
@@ -243,6 +248,7 @@ class _Noise:
                 for i, correlation in enumerate(noise_correlation(system, layout))
                 if correlation.any()
             ],
+            dark_slopes(system, layout),
         )
 
     def towards(self, other: _Noise, share: float) -> _Noise:
@@ -253,7 +259,7 @@ class _Noise:
             a, b, both = (np.prod(np.split(s[own], 2), axis=0) for s in (self.sigma, other.sigma, sigma))
             between = ((1 - share) * mine * a + share * theirs * b) / both
             correlated.append((own, np.asarray(between, np.float32)))
-        return _Noise(sigma, correlated)
+        return _Noise(sigma, correlated, self.dark)
 
 
 @dataclass(frozen=True, eq=False)

@@ -140,9 +140,23 @@ def noise_sigma(system: System, layout: Layout) -> Array:
 
     Centre of gravity of N electrons over ``pixels`` x ``pixels``: the spot's rms width along the slope times the excess
     noise over sqrt(N), and read noise summed over the pixels' squared distances, over N. Behind a field stop, of the
-    electrons that pass, and divided by how far the centre of gravity moves for a spot moved by 1.
+    electrons that pass, and divided by how far the centre of gravity moves for a spot moved by 1. In the dark, that of
+    a place anywhere on the pixels.
     """
-    return np.sqrt(np.concatenate([noise[[0, 1], [0, 1]].ravel() for noise in _noise(system, layout)]))
+    sigma = np.sqrt(np.concatenate([noise[[0, 1], [0, 1]].ravel() for noise in _noise(system, layout)]))
+    windows = np.repeat([s.pixels * s.pixel_scale for s in system.sensors], np.diff(layout.slope_start))
+    dark = dark_slopes(system, layout)
+    sigma[dark] = windows[dark] / math.sqrt(12)
+    return sigma
+
+
+def dark_slopes(system: System, layout: Layout) -> NDArray[np.intp]:
+    """Slopes (indices) of sub-apertures that get less than one electron a frame: a star that went away."""
+    dark = [
+        np.tile(_electrons(system, sensor, place) < 1, 2)
+        for sensor, place in zip(system.sensors, layout.sensors, strict=True)
+    ]
+    return np.flatnonzero(np.concatenate(dark))
 
 
 def noise_correlation(system: System, layout: Layout) -> list[Array]:
@@ -172,8 +186,13 @@ def _noise(system: System, layout: Layout) -> list[Array]:
     ]
 
 
+def _electrons(system: System, sensor: Sensor, layout: SensorLayout) -> Array:
+    """(n_valid,) detected in a frame."""
+    return sensor.photons * layout.size**2 * layout.illumination / system.rate_of(sensor)
+
+
 def _subaperture_noise(system: System, sensor: Sensor, layout: SensorLayout) -> Array:
-    electrons = sensor.photons * layout.size**2 * layout.illumination / system.rate_of(sensor)
+    electrons = _electrons(system, sensor, layout)
     pixel = (np.arange(sensor.pixels) - (sensor.pixels - 1) / 2) * sensor.pixel_scale
     read = sensor.read_noise**2 * sensor.pixels * (pixel**2).sum() * np.eye(2)[:, :, None]
     spot = _spot_covariance(system, sensor, layout)

@@ -24,6 +24,7 @@ HORIZON = 128
 """Frames that a message may be behind the newest command; a command stays at hand twice as long."""
 
 _OPEN = 1  # DmCommand's verdict; above it, the last command was held
+_SENSORS_ARE_THOSE_THAT_CAME = (3, 4, 5)  # held because some did not; with others, the sensors are those not closed
 
 
 class Matched(NamedTuple):
@@ -62,6 +63,7 @@ class Tally:
         absent: frame numbers of which nothing came.
         incomplete: some slopes did not come.
         unanswered: no command came for them.
+        sensor_closed: some sensor was closed, and whatever it sent was not the sky's.
         unknown_mirror: a command that was on the mirrors is not at hand, or nobody knows which it was.
         nonfinite: some slope, or the mirrors' shape, is no number.
         late, duplicate, malformed, foreign: messages behind the horizon; repeated; unreadable or of impossible
@@ -76,6 +78,7 @@ class Tally:
     absent: int = 0
     incomplete: int = 0
     unanswered: int = 0
+    sensor_closed: int = 0
     unknown_mirror: int = 0
     nonfinite: int = 0
     late: int = 0
@@ -87,7 +90,9 @@ class Tally:
     @property
     def left_out(self) -> int:
         """Frames asked for that were not put together."""
-        return self.absent + self.incomplete + self.unanswered + self.unknown_mirror + self.nonfinite
+        return (
+            self.absent + self.incomplete + self.unanswered + self.sensor_closed + self.unknown_mirror + self.nonfinite
+        )
 
 
 @dataclass
@@ -98,6 +103,7 @@ class _Session:
     commands: dict[int, DmCommand] = field(default_factory=dict)
     newest: int = -1  # frame that was answered
     done: int = -1  # frames up to here are decided
+    all_open: bool = True  # no sensor was closed when the last frame was decided
 
 
 class Matcher:
@@ -224,6 +230,11 @@ class Matcher:
             Whether it is decided, as it has to be ``behind`` the horizon; and the exposure, unless it is left out.
         """
         exposure, answer = session.exposures[frame], session.commands.get(frame)
+        if answer is not None and answer.verdict not in _SENSORS_ARE_THOSE_THAT_CAME:
+            session.all_open = answer.sensors == self._all_sensors
+        if answer is not None and not session.all_open:
+            self.tally.sensor_closed += 1
+            return True, None
         if exposure is None or exposure.arrived != self._all_sensors:
             self.tally.incomplete += behind
             return behind, None

@@ -22,7 +22,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from types import FrameType
-from typing import Any
+from typing import Any, get_args
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -32,6 +32,7 @@ from msgs_schema.msg import ReconstructorBlock as ReconstructorBlockMsg
 from msgs_schema.srv import PublishReconstructor, SwapReconstructor
 from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.clock import Clock, ClockType
+from rclpy.duration import Duration
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
@@ -42,6 +43,7 @@ from srtomo_core import wire
 from srtomo_core.layout import Layout
 from srtomo_core.reconstructor import Reconstructor, ReconstructorError, block_table, load_interaction_matrix
 from srtomo_core.system import InstrumentError, System, load_system
+from srtomo_srtc.closures import Closures, sets_of_lasers
 from srtomo_srtc.decide import Rules
 from srtomo_srtc.learner import Belief, Judgement, Learner, Outcome, lags_of, learned_sky
 from srtomo_srtc.listener import Listener
@@ -58,7 +60,9 @@ PRIORS: dict[str, Callable[[System], System]] = {"file": lambda system: system, 
 METHODS: dict[str, Callable[..., tuple[Reconstructor, Any]]] = {"implicit": implicit, "predictive": predictive}
 
 _LEARNED = "learned"
+_LAST_READER = Duration(seconds=1)
 _STAGING = 30.0  # s that the HRTC may take to stage a reconstructor
+_MOST_OF_CLOSURES = 2**30  # bytes that come with each reconstructor; the writer keeps two, and the HRTC three and one
 
 _PARAMETERS: tuple[tuple[str, Any, str], ...] = (
     ("system", "", "instrument: name or path of a .yaml file"),
@@ -66,6 +70,7 @@ _PARAMETERS: tuple[tuple[str, Any, str], ...] = (
     ("priors", ["file"], f"reconstructors to build at the start, by prior: {', '.join(PRIORS)}"),
     ("method", "implicit", f"of all reconstructors: {', '.join(METHODS)}"),
     ("interaction_matrix", "", "path of the calibrated interaction matrix (srtomo calibrate); empty: the model's own"),
+    ("closures", "singles", f"what is built for when lasers are closed: {', '.join(get_args(Closures))}"),
     ("learn", False, "learn the sky from telemetry, and publish reconstructors that are better by it"),
     ("auto_commit", False, "commit what was learned, and roll back what proves worse; false: leave that to operators"),
     ("window", 16.0, "telemetry that a sky is learned from, s; each window is judged once"),
@@ -135,8 +140,12 @@ class SrtcNode(Node):
         for name, least in _LEAST.items():
             if not values[name] >= least:
                 raise InstrumentError(f"parameter {name}: expected at least {least:g}, got {values[name]:g}")
+        if values["closures"] not in get_args(Closures):
+            raise InstrumentError(
+                f"parameter closures: expected one of {', '.join(get_args(Closures))}, got {values['closures']!r}"
+            )
         system = load_system(values["system"], json.loads(values["changes"]))
-        method = METHODS[values["method"]]
+        method = self._method = partial(METHODS[values["method"]], closures=self._that_fit(system, values["closures"]))
         G = None
         for prior in values["priors"]:
             if prior not in PRIORS:
@@ -155,6 +164,17 @@ class SrtcNode(Node):
                 raise InstrumentError("parameter priors: expected at least one to begin learning with")
             self._begin_learning(system, G, values)
         self.create_service(PublishReconstructor, "srtc/publish", self._publish)
+
+    def _that_fit(self, system: System, closures: Closures) -> Closures:
+        """The same, or the low order alone where they would take more memory than they may."""
+        layout, n = Layout(system), len(sets_of_lasers(system, closures))
+        size = 4 * n * layout.n_commands * (layout.n_slopes + layout.n_commands)
+        if size <= _MOST_OF_CLOSURES:
+            return closures
+        self.get_logger().warning(
+            f"closures: low_order, since {n} sets of lasers would take {size / 2**30:.1f} GiB with each reconstructor"
+        )
+        return "low_order"
 
     # -- publishing -------------------------------------------------------------------------------------------------
 
@@ -184,6 +204,9 @@ class SrtcNode(Node):
         return response
 
     def _send(self, reconstructor: Reconstructor) -> None:
+        # the topic keeps one manifest: the next would take the place of one that a busy reader has not got yet
+        self._manifests.wait_for_all_acked(_LAST_READER)
+        low = reconstructor.low_order
         message = ReconstructorMsg(
             id=reconstructor.id,
             sha256=list(reconstructor.sha256),
@@ -191,12 +214,15 @@ class SrtcNode(Node):
             n_commands=reconstructor.n_commands,
             n_slopes=reconstructor.n_slopes,
             n_epochs=reconstructor.n_epochs,
-            n_blocks=len(block_table(reconstructor.n_commands, reconstructor.n_epochs)),
+            n_blocks=len(block_table(reconstructor.n_commands, reconstructor.n_epochs, len(reconstructor.closures))),
             gain=reconstructor.gain,
             slope_reference=reconstructor.slope_reference.tolist(),
             command_limit=reconstructor.command_limit.tolist(),
             probe_commands=reconstructor.probe_commands.ravel().tolist(),
             probe_slopes=reconstructor.probe_slopes.ravel().tolist(),
+            closed_sensors=[closure.sensors for closure in reconstructor.closures],
+            low_order_commands=[] if low is None else low.commands.ravel().tolist(),
+            low_order_slopes=[] if low is None else low.slopes.ravel().tolist(),
             label=reconstructor.label,
             provenance=json.dumps(dict(reconstructor.provenance)),
         )
@@ -231,7 +257,7 @@ class SrtcNode(Node):
     # -- learning ---------------------------------------------------------------------------------------------------
 
     def _begin_learning(self, system: System, G: Any, values: dict[str, Any]) -> None:
-        method, predicts = METHODS[values["method"]], values["method"] == "predictive"
+        method, predicts = self._method, values["method"] == "predictive"
         rules = Rules(
             floor=values["floor"] * 1e-9, every=values["every"], watch=2 * values["window"], pause=values["pause"]
         )

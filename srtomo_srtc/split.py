@@ -67,7 +67,7 @@ class Split:
         )
         if sees.all() or not sees.any():
             raise ValueError("split: expected some stars that see tip-tilt and some that do not")
-        measured = _low_orders(system, layout)
+        measured = low_orders(system, layout)
         commands = low_order_commands(system, layout)
         answer = commands @ np.linalg.pinv(measured @ (G @ commands), rcond=_NEGLIGIBLE)
         return cls(np.flatnonzero(~sees), np.flatnonzero(sees), measured, answer, answer @ (measured @ G))
@@ -111,7 +111,7 @@ def focus_is_controlled(system: System, layout: Layout) -> bool:
     )
 
 
-def _low_orders(system: System, layout: Layout) -> Array:
+def low_orders(system: System, layout: Layout) -> Array:
     """(n_low, n_slopes) the low orders that seeing sensors measure, tip-tilt in rad whatever the number of lenslets."""
     with_focus = focus_is_controlled(system, layout)
     rows = []

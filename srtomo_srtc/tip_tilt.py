@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 from srtomo_core.layout import Layout
 from srtomo_core.reconstructor import Reconstructor
 from srtomo_core.system import System
+from srtomo_srtc.closures import bits
 from srtomo_srtc.mirrors import interaction_matrix
 from srtomo_srtc.model import layout_of
 from srtomo_srtc.noise import sensor_noise
@@ -104,6 +105,7 @@ def _joined(made: Reconstructor, G: Array, R_t: Array, system: System, layout: L
         R[:, ~own] = R_h - seen @ R_h
         return R + R_t if newest else R
 
+    high = [i for i in range(len(layout.sensors)) if i not in layout.tip_tilt_sensors]
     return Reconstructor.from_matrices(
         np.stack([whole(R_h, epoch == 0) for epoch, R_h in enumerate(made.R)]),
         np.where(own[:, None], 0.0, G),
@@ -113,4 +115,8 @@ def _joined(made: Reconstructor, G: Array, R_t: Array, system: System, layout: L
         label=made.label,
         provenance={**made.provenance, "tip_tilt_rate_hz": system.loop.rate / system.loop.tip_tilt_frames},
         fallback=None if made.fallback_R is None else whole(made.fallback_R, True),
+        closures={
+            bits(i for w, i in enumerate(high) if closure.sensors >> w & 1): whole(closure.R, True)
+            for closure in made.closures
+        },
     )

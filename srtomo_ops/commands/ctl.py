@@ -23,6 +23,8 @@ EXAMPLE = """examples:
   srtomo ctl close                          close the loop
   srtomo ctl flat                           open it, and put the static shape on at once
   srtomo ctl set slew_limit=1e-7 gain_ramp=50    parameters of the HRTC, in their own units (m; frames)
+  srtomo ctl close-sensor lgs2              a laser goes away: the commands do without its sensor
+  srtomo ctl open-sensor lgs2               it is back
   srtomo ctl sky --set 'atmosphere.r0=10 cm' --over 10s    change the simulated plant while it runs
   srtomo ctl dither gnao_ltao_sr --rms 5nm --over 30s      for 'srtomo register': shakes the mirrors, then flat
   srtomo ctl status"""
@@ -31,8 +33,10 @@ _PATIENCE = 10.0  # s to find a node: one that was just started takes some secon
 
 _ACTIONS = (
     "status", "configure", "activate", "deactivate", "cleanup", "close", "open", "flat", "set", "start-sim", "publish",
-    "commit", "roll-back", "sky", "dither",
+    "commit", "roll-back", "close-sensor", "open-sensor", "sky", "dither",
 )  # fmt: skip
+
+_SENSORS = ("close-sensor", "open-sensor")
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -42,7 +46,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "words",
         metavar="WORD",
         nargs="*",
-        help="publish: LABEL; commit, roll-back: ID SHA256 (hex); dither: SYSTEM; set: NAME=VALUE ...",
+        help="publish: LABEL; commit, roll-back: ID SHA256 (hex); dither: SYSTEM; set: NAME=VALUE ...; "
+        "close-sensor, open-sensor: NAME ...",
     )
     parser.add_argument("--namespace", default="", help="of the instrument (default: none)")
     parser.add_argument(
@@ -73,7 +78,10 @@ def main(options: argparse.Namespace) -> int:
         options.action, ""
     )
     values = _values(options.words) if options.action == "set" else {}
-    if not values and len(options.words) != len(expected.split()):
+    if options.action in _SENSORS:
+        if not options.words:
+            raise ValueError(f"{options.action}: expected the name of a sensor, or of several, after it")
+    elif not values and len(options.words) != len(expected.split()):
         raise ValueError(
             f"{options.action}: expected {expected or 'nothing'} after it, got {' '.join(options.words) or 'nothing'}"
         )
@@ -107,6 +115,9 @@ def main(options: argparse.Namespace) -> int:
             numbers = {"id": f"{identity:016x}", "sha256": sha256.hex()}
         elif options.action in ("commit", "roll-back"):
             numbers = {"first_frame": operator.commit(identity, sha256, roll_back=options.action == "roll-back")}
+        elif options.action in _SENSORS:
+            first_frame, message = operator.close_sensors(options.words, options.action == "close-sensor")
+            numbers = {"first_frame": first_frame, "message": message}
         elif options.action == "sky":
             numbers = {"first_frame": operator.change_sky(changes, options.over, options.after)}
         elif options.action == "dither":

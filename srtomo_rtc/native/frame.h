@@ -39,6 +39,7 @@ enum srt_verdict {
     SRT_HOLD_MISSING,
     SRT_HOLD_BEHIND,
     SRT_HOLD_HISTORY,
+    SRT_HOLD_CLOSED,
     SRT_VERDICTS,
 };
 
@@ -58,6 +59,7 @@ typedef struct {
     const float *R_scales[SRT_MAX_SENSORS]; /* (n_rows) each: R holds 16-bit integers; NULL: float32 */
     const srt_low_rank *low_rank;           /* (n_sensors) instead of R, with scales; NULL: none */
     const uint32_t *rows;                   /* (n_rows) of low_rank: which command's each row is */
+    /* of sensors that the program does without, all three are never read */
     const float *Q;
 } srt_matrices;
 
@@ -76,6 +78,8 @@ typedef struct {
     uint32_t fault_budget;
     uint32_t n_epochs;
     uint32_t polc;
+    uint32_t sensors;    /* bit w: sensor w is in the sum; others are not waited for, and what they send is ignored */
+    uint32_t held;       /* not 0: these sensors only say when to answer; the command is held */
     uint32_t ramp;       /* frames in which the gain rises to its value once the loop is closed; 0: at once */
     float gain, keep, relaxation;
     float retained;      /* 1 - leak: `keep` before POLC's share of the gain is off it */
@@ -123,7 +127,7 @@ typedef struct {
     uint64_t opened_by_faults, opened_by_silence;
     float mirror_fraction;
     float gain;                /* of the next frame; what the last was made with until it is prepared */
-    uint32_t sensors, used, all_sensors;
+    uint32_t sensors, used, all_sensors, wanted; /* wanted: of the program that runs */
     uint32_t consecutive_holds, frames_closed; /* answered since the loop was closed */
     uint32_t n_clipped, n_slewed;
     int32_t scaled;            /* the whole command was made smaller */
@@ -149,7 +153,7 @@ typedef struct {
     uint32_t first_slope[SRT_MAX_SENSORS];
     uint32_t multiplied[SRT_MAX_SENSORS]; /* sub-apertures whose products are in the sums */
     float *slopes;                /* (SRT_ROWS, n_slopes): frame k in row k % SRT_ROWS, in R's order */
-    int64_t kept[SRT_ROWS];       /* the frame, if it was answered OK */
+    int64_t kept[SRT_ROWS];       /* the frame, if it was answered OK with all sensors */
     srt_mirror mirror[SRT_ROWS];
     float *sums;                  /* (n_sensors, n_rows): R_w y_w so far */
     float *flat, *on_mirror, *q, *product, *older, *prepared, *trial; /* (n_rows) each */
@@ -238,7 +242,7 @@ void srt_ring_write(srt_ring *ring, uint32_t channel, int64_t now_ns, const uint
 /* Names as in msgs_schema/msg/HrtcStatus. */
 typedef struct {
     uint64_t commands;
-    uint64_t held_nonfinite, held_incomplete, held_missing, held_behind, held_history;
+    uint64_t held_nonfinite, held_incomplete, held_missing, held_behind, held_history, held_closed;
     uint64_t dropped_duplicate, dropped_late, dropped_session, dropped_fingerprint, dropped_malformed;
     uint64_t clipped, slewed, scaled;
     uint64_t fallback;     /* answered from one exposure, of a program of several */

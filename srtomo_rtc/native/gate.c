@@ -298,6 +298,13 @@ static exposure *exposure_of(gate *g, int64_t frame)
     return &g->exposures[frame % SRT_AHEAD];
 }
 
+/* Whether every sensor that the program wants is here. */
+static bool whole(const gate *g, const exposure *e)
+{
+    uint32_t wanted = g->shared.loop->wanted;
+    return (e->arrived & wanted) == wanted;
+}
+
 /* reason: why the loop may open now, if it was not asked to */
 static void prepare_for(gate *g, int reason, int64_t number)
 {
@@ -378,7 +385,7 @@ static void answer_next(gate *g, int verdict)
     srt_counters *counters = &g->shared.counters;
     int64_t frame = loop->frame;
     exposure *e = exposure_of(g, frame);
-    int64_t since_ns = e->arrived == loop->all_sensors ? e->complete_ns : g->decided_ns;
+    int64_t since_ns = loop->wanted && whole(g, e) ? e->complete_ns : g->decided_ns;
     const srt_program *program = loop->program;
     bool alone = program && program->n_epochs > 1 && !loop->several;
     if (verdict == FLATTEN)
@@ -423,6 +430,9 @@ static void answer_next(gate *g, int verdict)
     case SRT_HOLD_HISTORY:
         counters->held_history++;
         break;
+    case SRT_HOLD_CLOSED:
+        counters->held_closed++;
+        break;
     }
     g->used[frame % RECENT] = loop->used;
     int32_t sec = e->stamp_sec;
@@ -436,7 +446,7 @@ static void answer_next(gate *g, int verdict)
 static void skip_next(gate *g)
 {
     const srt_loop *loop = g->shared.loop;
-    answer_next(g, loop->sensors == loop->all_sensors ? SRT_HOLD_BEHIND : SRT_HOLD_MISSING);
+    answer_next(g, loop->sensors == loop->wanted ? SRT_HOLD_BEHIND : SRT_HOLD_MISSING);
 }
 
 static void advance(gate *g)
@@ -445,9 +455,9 @@ static void advance(gate *g)
     while (g->newest >= loop->frame) {
         if (g->newest - loop->frame > g->max_behind)
             skip_next(g);
-        else if (loop->sensors == loop->all_sensors)
+        else if (loop->sensors == loop->wanted)
             answer_next(g, SRT_OK);
-        else if (g->newest >= loop->frame + 2 || exposure_of(g, loop->frame + 1)->arrived == loop->all_sensors)
+        else if (g->newest >= loop->frame + 2 || whole(g, exposure_of(g, loop->frame + 1)))
             answer_next(g, SRT_HOLD_MISSING);
         else
             return;
@@ -614,6 +624,9 @@ int64_t srt_gate_offer(srt_gate *shared, const uint8_t *message, size_t size, in
     }
     int64_t frame = (int64_t)s.frame, ahead = frame - loop->frame;
     bool same = s.session == shared->session;
+    uint32_t held = (uint32_t)(((1ull << s.n_sensors) - 1) << s.sensor);
+    if (same && ahead < 0 && !(held & loop->wanted))
+        return frame; /* nobody waits for a closed sensor: it may come when it likes */
     if (same && ahead < 0) {
         bool recent = -ahead <= RECENT && frame >= loop->first_frame;
         if (recent && g->used[frame % RECENT] >> s.sensor & 1)

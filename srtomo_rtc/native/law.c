@@ -37,7 +37,7 @@ srt_loop *srt_loop_new(const uint32_t *n_subapertures, uint32_t n_sensors, uint3
     if (!loop)
         return NULL;
     loop->n_sensors = n_sensors;
-    loop->all_sensors = (uint32_t)((1ull << n_sensors) - 1) & ~tip_tilt_sensors;
+    loop->all_sensors = loop->wanted = (uint32_t)((1ull << n_sensors) - 1) & ~tip_tilt_sensors;
     loop->n_commands = n_commands;
     loop->n_rows = (n_commands + SRT_TILE_INT16 - 1) / SRT_TILE_INT16 * SRT_TILE_INT16;
     loop->max_epochs = max_epochs;
@@ -310,6 +310,7 @@ void srt_loop_prepare(srt_loop *loop)
     if (posted) {
         loop->program = posted;
         loop->token = posted->token;
+        loop->wanted = posted->sensors & loop->all_sensors;
     }
     int requested = atomic_load(&loop->requested);
     if (requested == SRT_CLOSED && loop->program && !loop->closed)
@@ -323,6 +324,8 @@ void srt_loop_prepare(srt_loop *loop)
 
 void srt_loop_multiply(srt_loop *loop, uint32_t sensor, uint32_t n)
 {
+    if (!(loop->wanted >> sensor & 1))
+        return;
     const float *slopes = srt_loop_slopes(loop, loop->frame, sensor);
     size_t first = 2 * (size_t)loop->multiplied[sensor], last = 2 * (size_t)n;
     loop->finite = srt_all_finite(slopes + first, last - first) && loop->finite;
@@ -422,7 +425,7 @@ static void slew(srt_loop *loop, const float *offset)
 static int finish(srt_loop *loop, int verdict)
 {
     const srt_program *program = loop->program;
-    if (verdict == SRT_OK || verdict == SRT_OPEN)
+    if (verdict == SRT_OK || verdict == SRT_OPEN || verdict == SRT_HOLD_CLOSED)
         loop->consecutive_holds = 0;
     else
         loop->consecutive_holds++;
@@ -444,7 +447,7 @@ static int finish(srt_loop *loop, int verdict)
         loop->frames_closed++;
     int64_t frame = loop->frame;
     copy(loop->history + (size_t)(frame % SRT_HISTORY) * loop->n_rows, loop->command, loop->n_rows);
-    keep(loop, frame, verdict == SRT_OK,
+    keep(loop, frame, verdict == SRT_OK && loop->wanted == loop->all_sensors,
          (srt_mirror){loop->mirror_frame, loop->mirror_frame_before, loop->mirror_fraction});
     loop->verdict = verdict;
     loop->used = loop->sensors | loop->tip_tilt.used;
@@ -465,9 +468,11 @@ static bool known(const srt_loop *loop, int64_t frame)
 
 int srt_loop_answer(srt_loop *loop, int64_t newest, int64_t before, float fraction)
 {
+    const srt_program *program = loop->program;
+    if (program && program->held)
+        return finish(loop, SRT_HOLD_CLOSED); /* an open loop relaxes all the same */
     if (!loop->closed)
         return finish(loop, SRT_OPEN);
-    const srt_program *program = loop->program;
     if (!loop->finite)
         return finish(loop, SRT_HOLD_NONFINITE);
     if (program->polc && newest != SRT_MIRROR_UNKNOWN) {
@@ -483,7 +488,7 @@ int srt_loop_answer(srt_loop *loop, int64_t newest, int64_t before, float fracti
     const float *prepared = loop->prepared;
     zero(total, m);
     for (uint32_t w = 0; w < loop->n_sensors; w++)
-        if (loop->all_sensors >> w & 1)
+        if (loop->wanted >> w & 1)
             add_scaled(loop, loop->matrices, w, loop->sums + (size_t)w * m, total);
     for (size_t i = 0; i < m; i++)
         trial[i] = prepared[i] + gain * total[i];

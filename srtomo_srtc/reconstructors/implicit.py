@@ -20,6 +20,7 @@ from srtomo_core.layout import Layout
 from srtomo_core.reconstructor import Reconstructor
 from srtomo_core.system import System
 from srtomo_srtc.atmosphere import Profile
+from srtomo_srtc.closures import Closures, low_order_of, sets_of_lasers, without
 from srtomo_srtc.covariance import Turbulence, slope_tiles
 from srtomo_srtc.crossterms import right_hand_side
 from srtomo_srtc.estimator import commands_from_tiles
@@ -50,6 +51,7 @@ def implicit(
     lag: float = 0.0,
     oversampling: int = OVERSAMPLING,
     fast: bool = False,
+    closures: Closures = "none",
     threads: int = 1,
     progress: Callable[[str, float], None] | None = None,
 ) -> tuple[Reconstructor, Array]:
@@ -67,6 +69,8 @@ def implicit(
         lag: estimate the wavefront so much later than the exposure, every layer gone with its wind, s.
         oversampling: of the gradients' nodes, 1, 2 or 4 a sub-aperture.
         fast: float32, and interpolated covariances where that is quicker; the wavefront error stays within 0.1 nm.
+        closures: for when a laser goes away, also build what does without it: ``singles``, each laser alone, or
+            ``pairs``, every two as well; both with the ``low_order`` of natural stars for when others are closed.
         threads: to compute with, apart from those of the BLAS library.
         progress: called with the name of each stage and the share of the work done before it, 0 to 1.
 
@@ -75,9 +79,11 @@ def implicit(
 
     Raises:
         ValueError: the layout has other slopes or commands than the system, or a dark sub-aperture; or there is
-            nothing to split.
+            nothing to split; or closures of a split estimate.
         MemoryError: one line, before any work, if there is not enough.
     """
+    if split and closures != "none":
+        raise ValueError("closures: expected without split")
     nominal = Layout(system)
     layout = nominal if layout is None else layout
     if (*layout.slope_start, *layout.command_start) != (*nominal.slope_start, *nominal.command_start):
@@ -87,7 +93,8 @@ def implicit(
 
     stages.enter("geometry", 0.0)
     low_orders = split_needs(system, layout) if split else 0.0
-    require(bytes_needed(layout, fast, low_orders), f"implicit reconstructor of {system.name}")
+    n_closures = len(sets_of_lasers(system, closures))
+    require(bytes_needed(layout, fast, low_orders, n_closures), f"implicit reconstructor of {system.name}")
     profile = Profile.of(system)
     sensors = sightlines(system, layout, profile, oversampling)
     fit = Fit(system, layout, kappa)
@@ -120,9 +127,14 @@ def implicit(
 
     stages.enter("solution", 0.55)
     parts = Split.of(system, layout, G) if split else None
+    sets, variants = sets_of_lasers(system, closures), {}
+    ends = 0.8 if sets else 1.0
     R = commands_from_tiles(
-        S, wanted, blind, fit.solve, parts, noise, threads, lambda done: stages.within(done, 0.55, 1.0)
+        S, wanted, blind, fit.solve, parts, noise, threads, lambda done: stages.within(done, 0.55, ends)
     )
+    if sets:
+        stages.enter("closures", ends)
+        variants = without(R, S, blind, layout, sets, threads, lambda done: stages.within(done, ends, 1.0))
     del S, wanted
 
     stages.enter("done", 1.0)
@@ -133,6 +145,8 @@ def implicit(
         gain=system.loop.gain,
         command_limit=nominal.stroke,
         label=label,
+        closures=variants,
+        low_order=None if closures == "none" else low_order_of(system, layout, G),
         threads=threads,
         provenance=provenance(
             system,
@@ -144,16 +158,18 @@ def implicit(
             lag_s=lag,
             oversampling=oversampling,
             fast=fast,
+            closures=closures,
         ),
     )
     return reconstructor, G
 
 
-def bytes_needed(layout: Layout, fast: bool, low_orders: float = 0.0) -> float:
+def bytes_needed(layout: Layout, fast: bool, low_orders: float = 0.0, n_closures: int = 0) -> float:
     """Memory of :func:`implicit` at its peak, about.
 
     Args:
         low_orders: what the split takes, if there is one (:func:`srtomo_srtc.split.bytes_needed`).
+        n_closures: sets of closed lasers that something is built for.
     """
     dtype = np.dtype(np.float32 if fast else np.float64)
     matrix = layout.n_slopes * layout.n_commands
@@ -164,4 +180,6 @@ def bytes_needed(layout: Layout, fast: bool, low_orders: float = 0.0) -> float:
         solving = tiles + right + max(low_orders, tiles + 2 * right)
     # R in float64, and twice in float32, while Q is formed
     ending = matrix * (8 + 2 * 4)
-    return matrix * 8 + 3 * 8 * layout.n_commands**2 + max(solving, ending)
+    # R in float64, then rounded and frozen, and Q
+    closing = n_closures * (16 * matrix + 4 * layout.n_commands**2)
+    return matrix * 8 + 3 * 8 * layout.n_commands**2 + max(solving, ending) + closing

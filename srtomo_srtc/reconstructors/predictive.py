@@ -27,6 +27,7 @@ from srtomo_core.layout import Layout
 from srtomo_core.reconstructor import Reconstructor, n_parts
 from srtomo_core.system import System
 from srtomo_srtc.atmosphere import Profile
+from srtomo_srtc.closures import Closures
 from srtomo_srtc.covariance import Turbulence, slope_tiles
 from srtomo_srtc.crossterms import right_hand_side
 from srtomo_srtc.estimator import commands_from_tiles
@@ -56,6 +57,7 @@ def predictive(
     wind_uncertainty: float | Sequence[float] = 0.0,
     oversampling: int = OVERSAMPLING,
     fast: bool = False,
+    closures: Closures = "none",
     threads: int = 1,
     progress: Callable[[str, float], None] | None = None,
 ) -> tuple[Reconstructor, Array]:
@@ -68,6 +70,8 @@ def predictive(
             loop ``epochs + 1`` times the memory.
         wind_uncertainty: 1 sigma of each component of the layers' velocities, m/s, one for all or one for each: see
             :func:`srtomo_srtc.wind.with_trusted_winds`, which says how far a wind is then followed.
+        closures: as :func:`implicit`; they are made from the newest exposure alone, and so predict less with
+            several.
 
     Other arguments, return value and errors as :func:`implicit`.
 
@@ -91,7 +95,7 @@ def predictive(
 
     alone, G = implicit(
         believed, layout, label=label, noise_gain=gain, kappa=kappa, split=split, lag=lag, oversampling=oversampling,
-        fast=fast, threads=threads, progress=first,
+        fast=fast, closures=closures, threads=threads, progress=first,
     )  # fmt: skip
     if epochs == 1:
         if believed is not system:
@@ -150,8 +154,10 @@ def predictive(
             **said,
             oversampling=oversampling,
             fast=fast,
+            closures=closures,
         ),
     )
+    reconstructor = replace(reconstructor, closures=alone.closures, low_order=alone.low_order)
     return reconstructor, G
 
 

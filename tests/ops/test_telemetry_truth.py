@@ -11,7 +11,7 @@ from srtomo_core.bag import BagReader
 from srtomo_core.layout import Layout
 from srtomo_core.reconstructor import Reconstructor
 from srtomo_core.system import System, load_system
-from srtomo_core.wire import MIRROR_UNKNOWN, DmCommandWriter, SlopeFrameWriter
+from srtomo_core.wire import MIRROR_UNKNOWN, DmCommandWriter, SlopeFrameWriter, read_dm_command
 from srtomo_ops.simulate import plain_settings, program_of
 from srtomo_rtc.loop import Loop, Program, Settings, Slot
 from srtomo_sim.mirror import interaction_matrix
@@ -294,3 +294,20 @@ def test_refuses_another_instruments_interaction_matrix_and_too_few_frames(mini:
         Telemetry(mini, sky.interaction[:-1])
     with pytest.raises(ValueError, match="at least 2 frames to count, got 0"):
         Telemetry(mini, sky.interaction).statistics()
+
+
+def test_frames_with_a_closed_sensor_are_left_out(sky: Sky, messages) -> None:
+    """What it sent is no sky. A frame held because a sensor was late is good, as long as none was closed."""
+    matcher = Matcher(sky.layout)
+    writer = DmCommandWriter("hrtc", sky.layout.n_commands)
+    said = {k: (0, 0b1101) for k in range(100, 120)} | {110: (3, 0b0101), 130: (3, 0b1011), 140: (7, 0b1101)}
+    altered = []
+    for is_slopes, data in messages:
+        if not is_slopes and (answer := read_dm_command(data)).frame in said:
+            verdict, sensors = said[answer.frame]
+            writer.values[:] = answer.commands
+            data = writer.write(*answer._replace(verdict=verdict, sensors=sensors)[:-1])
+        altered.append((is_slopes, data))
+    frames = {matched.frame for matched in _matched(matcher, altered)}
+    assert matcher.tally.sensor_closed == 21
+    assert set(range(90, 150)) - frames == {*range(100, 120), 140}

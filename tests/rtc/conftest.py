@@ -14,7 +14,7 @@ from srtomo_core import wire
 from srtomo_core.bag import BagWriter
 from srtomo_core.layout import Layout
 from srtomo_core.messages import encode
-from srtomo_core.reconstructor import Reconstructor, block_table
+from srtomo_core.reconstructor import LowOrder, Reconstructor, block_table
 from srtomo_core.system import load_system
 from srtomo_core.wire import SlopeFrameWriter, read_dm_command
 from srtomo_rtc.events import EventKind, change_fields, state_fields
@@ -29,7 +29,8 @@ PERIOD = 5_000_000  # ns
 
 @pytest.fixture(scope="session")
 def mini():
-    """``mini``: system, layout, G, and two reconstructors a and b that pass every check of a swap."""
+    """``mini``: system, layout, G, and reconstructors a, b and c that pass every check of a swap; c can do without
+    lasers."""
     system = load_system("mini")
     layout = Layout(system)
     G = interaction_matrix(system, layout)
@@ -41,12 +42,34 @@ def mini():
         )
 
     scale = np.linalg.norm(G, 2) ** 2
+
+    def closable(regularisation: float) -> Reconstructor:
+        """One that has R for each laser alone being closed, and the low order of the natural star."""
+
+        def least_squares(closed: int) -> np.ndarray:
+            seen = G.copy()
+            for w in range(len(layout.sensors)):
+                if closed >> w & 1:
+                    seen[layout.slopes_of(w)] = 0
+            return np.linalg.solve(seen.T @ seen + regularisation * np.eye(layout.n_commands), seen.T)
+
+        x, y = layout.mirrors[0].actuators.T
+        tilts = np.stack([x, y]) * 1e-7
+        natural = np.zeros((2, layout.n_slopes))
+        natural[:, layout.slopes_of(3)] = np.linalg.inv(G[layout.slopes_of(3)] @ tilts.T)
+        return Reconstructor.from_matrices(
+            least_squares(0), G, fingerprint=layout.fingerprint, gain=0.5, command_limit=layout.stroke, label="c",
+            closures={closed: least_squares(closed) for closed in (0b1, 0b10, 0b100)},
+            low_order=LowOrder(tilts, natural),
+        )  # fmt: skip
+
     return SimpleNamespace(
         system=system,
         layout=layout,
         G=G.astype(np.float32),
         a=reconstructor(3e-3 * scale, "a"),
         b=reconstructor(1e-2 * scale, "b"),
+        c=closable(1e-2 * scale),
     )
 
 
@@ -62,14 +85,18 @@ def manifest_of(reconstructor: Reconstructor, **changes) -> Manifest:
         "n_commands": reconstructor.n_commands,
         "n_slopes": reconstructor.n_slopes,
         "n_epochs": reconstructor.n_epochs,
-        "n_blocks": len(block_table(reconstructor.n_commands, reconstructor.n_epochs)),
+        "n_blocks": len(block_table(reconstructor.n_commands, reconstructor.n_epochs, len(reconstructor.closures))),
         "gain": reconstructor.gain,
         "slope_reference": reconstructor.slope_reference,
         "command_limit": reconstructor.command_limit,
         "probe_commands": reconstructor.probe_commands.ravel(),
         "probe_slopes": reconstructor.probe_slopes.ravel(),
         "label": reconstructor.label,
+        "closed_sensors": tuple(closure.sensors for closure in reconstructor.closures),
     }
+    if reconstructor.low_order is not None:
+        fields["low_order_commands"] = reconstructor.low_order.commands.ravel()
+        fields["low_order_slopes"] = reconstructor.low_order.slopes.ravel()
     return Manifest(**{**fields, **changes})
 
 
@@ -205,6 +232,18 @@ class Bench:
 
     def roll_back(self, reconstructor: Reconstructor) -> None:
         self.labels[id(self.swap.roll_back(reconstructor.id, reconstructor.sha256))] = EventKind.ROLLBACK
+
+    def close_sensors(self, *sensors: int) -> None:
+        """These sensors are closed from the next frame on, and no others."""
+        self.swap.change_settings(closed_sensors=sum(1 << w for w in sensors))
+        self.hrtc.idle(self.now)  # the loop's thread is woken
+
+    def dark(self, k: int, *sensors: int) -> np.ndarray:
+        """Slopes of frame ``k``, but what some sensors send is no number."""
+        slopes = self.sky.slopes(k)
+        for w in sensors:
+            slopes[self.layout.slopes_of(w)] = np.nan
+        return slopes
 
     def close(self, reconstructor: Reconstructor) -> None:
         """Commit a reconstructor and close the loop."""

@@ -210,3 +210,40 @@ def test_the_flat_that_a_stopping_hrtc_leaves_is_no_loss():
     instrument.slopes(1, 10)
     instrument.now += 1
     assert (instrument.ledger.lost, instrument.ledger.frames) == ((0, 0), 11)
+
+
+@given(st.sets(st.integers(0, 40)), st.sets(st.integers(0, 40)))
+def test_frames_of_either(a, b):
+    left, right = FrameSet(), FrameSet()
+    for frame in a:
+        left.add(frame)
+    for frame in b:
+        right.add(frame)
+    either = left | right
+    missing = {frame for first, last in either.gaps(0, 40) for frame in range(first, last + 1)}
+    assert missing == set(range(41)) - (a | b) and len(either) == len(a | b)
+
+
+def test_a_closed_sensor_owes_nothing():
+    """What it did not send before it was closed, and after it was opened, is lost all the same."""
+    instrument = Instrument()
+    instrument.slopes(0, *range(40))
+    instrument.slopes(1, *range(0, 8), 15, *range(31, 40))
+    instrument.commands(*range(40))
+    assert (instrument.ledger.lost, instrument.ledger.frames) == ((22, 0), 18)
+    instrument.ledger.add_closed(SESSION, 0, 0)
+    instrument.ledger.add_closed(SESSION, 10, 0b10)
+    instrument.ledger.add_closed(SESSION, 20, 0b10)  # told again with a swap
+    instrument.ledger.add_closed(SESSION, 30, 0b01)
+    assert (instrument.ledger.lost, instrument.ledger.frames) == ((3, 0), 37)
+    (session,) = instrument.ledger.report()
+    assert [stream["gaps"] for stream in session["slopes"]] == [[], [(8, 9), (30, 30)]]
+
+
+def test_a_sensor_that_stays_closed_is_not_waited_for_at_the_end():
+    instrument = Instrument(in_flight=5)
+    instrument.slopes(0, *range(21))
+    instrument.slopes(1, *range(10))
+    instrument.commands(*range(19))
+    instrument.ledger.add_closed(SESSION, 10, 0b10)
+    assert (instrument.ledger.lost, instrument.ledger.frames) == ((0, 0), 19)
