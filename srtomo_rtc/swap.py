@@ -37,7 +37,9 @@ SCALE_LIMITS = (0.5, 1.2)
 """Where ``w.(G_cal R w) / w.w`` must lie for the slopes w = G_cal v of smooth, seen shapes v of each mirror.
 
 A wrong sign or scale is refused. In slopes, not in commands: with several mirrors a shape may rightly come back on
-others that look the same to the sensors.
+others that look the same to the sensors. Where sensors are closed, the estimate with the rest rightly corrects less
+(with stars far apart under strong high layers 0.43 of a shape where all together do 0.75): what a closure corrects must
+lie there relative to what the newest exposure of all sensors does.
 """
 
 MAX_CLOSURES = 8
@@ -86,7 +88,7 @@ class Check:
     Attributes:
         stability: :func:`stability`, of the fallback and the closures too: the largest one.
         scale: range of ``w.(G_cal R w) / w.w`` for the slopes w of smooth shapes, R summed over the epochs, and of the
-            fallback's and closures'; NaN where no mirror is seen.
+            fallback's; NaN where no mirror is seen.
         unseen: names of mirrors that no sensor sees, whose sign and scale nothing here can tell.
         compression: what a kernel that does not hold R in float32 makes of it; empty: nothing.
     """
@@ -243,12 +245,12 @@ def check(
         slopes = np.concatenate(shapes).astype(np.float32) @ G_cal.T
         power = np.einsum("ij,ij->i", slopes, slopes, dtype=np.float64)
         ratios = [np.einsum("ij,ij->i", slopes, slopes @ R.T @ G_cal.T, dtype=np.float64) / power for R in sums]
-        low, high = float(np.min(ratios)), float(np.max(ratios))
-        if not SCALE_LIMITS[0] <= low <= high <= SCALE_LIMITS[1]:
-            raise Refused(
-                f"wrong sign or scale: of the slopes of smooth shapes, {low:.3g} to {high:.3g} is corrected, "
-                f"expected {SCALE_LIMITS[0]:g} to {SCALE_LIMITS[1]:g}"
-            )
+        whole = len(ratios) - len(reconstructor.closures)
+        low, high = _check_scale(ratios[:whole], "of the slopes of smooth shapes, {} is corrected")
+        for closure, ratio in zip(reconstructor.closures, ratios[whole:], strict=True):
+            closed = ", ".join(sensor.name for w, sensor in enumerate(layout.sensors) if closure.sensors >> w & 1)
+            relative = "without " + closed + ", {} of what else is corrected of smooth shapes"
+            _check_scale([ratio / ratios[whole - 1]], relative)
     if not max(stabilities) < STABILITY_LIMIT:
         raise Refused(
             f"not stable enough: spectral radius of Q - R G_cal is {max(stabilities):.3f}, limit {STABILITY_LIMIT:g}"
@@ -257,6 +259,22 @@ def check(
         _check_low_order(reconstructor.low_order, reconstructor.gain, G_cal, delay)
     unseen = tuple(mirror.name for mirror, some in zip(layout.mirrors, seen, strict=True) if not some)
     return Check(max(stabilities), (low, high), unseen)
+
+
+def _check_scale(ratios: list[Floats], told: str) -> tuple[float, float]:
+    """The range of all, which must be within :data:`SCALE_LIMITS`.
+
+    Args:
+        told: with {} where the range goes.
+
+    Raises:
+        Refused: it is not.
+    """
+    low, high = float(np.min(ratios)), float(np.max(ratios))
+    if not SCALE_LIMITS[0] <= low <= high <= SCALE_LIMITS[1]:
+        limits = f"expected {SCALE_LIMITS[0]:g} to {SCALE_LIMITS[1]:g}"
+        raise Refused(f"wrong sign or scale: {told.format(f'{low:.3g} to {high:.3g}')}, {limits}")
+    return low, high
 
 
 def _check_tip_tilt(R: Floats, layout: Layout, G_cal: Floats) -> None:

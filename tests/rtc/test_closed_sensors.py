@@ -224,6 +224,7 @@ def test_every_refusal(swap, mini, helpers) -> None:
         (changed(mini, 0, R=nan), "closures: hold values that are not finite"),
         (changed(mini, 0, Q=0.9 * first.Q), "Q is not R G"),
         (changed(mini, 0, R=-first.R, Q=-first.Q), "wrong sign or scale"),
+        *((changed(mini, 0, R=f * first.R, Q=f * first.Q), "wrong sign or scale: without lgs1, ") for f in (0.4, 1.3)),
         (changed(mini, 0, R=wrong_mirror @ first.R, Q=wrong_mirror @ first.Q), "wrong sign or scale|not stable"),
         (replace(c, low_order=LowOrder(-low.commands, low.slopes)), "low_order: an integrator of gain 0.5 times -1"),
         (replace(c, low_order=LowOrder(1.5 * low.commands, low.slopes)), "is not stable enough"),
