@@ -27,6 +27,16 @@ def add_system(parser: argparse.ArgumentParser, default: str | None = None) -> N
     )
 
 
+def add_registration(parser: argparse.ArgumentParser) -> None:
+    """``--registration FILE``."""
+    parser.add_argument(
+        "--registration",
+        metavar="FILE",
+        type=Path,
+        help="sensors where 'srtomo register --json FILE' found them; slopes, commands and fingerprint stay",
+    )
+
+
 def assignments(items: list[str], option: str) -> dict[str, Any]:
     """``KEY=VALUE`` items: values are JSON where they can be, otherwise strings.
 

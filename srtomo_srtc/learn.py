@@ -128,12 +128,13 @@ class Learned:
     fitted: NDArray[np.float32]
     sampling: Sampling
 
-    def system(self, system: System, velocity: Array | None = None) -> System:
+    def system(self, system: System, velocity: Array | None = None, layout: Layout | None = None) -> System:
         """The instrument with this sky and noise in it. Sensors with a measured noise covariance keep it.
 
         Args:
             system: whose telemetry was learned from.
             velocity: (n_layers, 2) of the layers, where they go, m/s; by default that of the system's own sky.
+            layout: where sensors were taken to be.
         """
         flow = winds_at(system, self.altitudes) if velocity is None else velocity
         layers = [
@@ -148,7 +149,7 @@ class Learned:
         ]
         sky = Atmosphere(r0=self.r0, outer_scale=self.outer_scale, layers=tuple(layers))
         changes: dict[str, object] = {"atmosphere": sky.model_dump()}
-        layout = Layout(system)
+        layout = layout_of(system, layout)
         for level in self.noise:
             sensor = system.sensors[level.sensor]
             if sensor.noise_covariance is None:

@@ -16,6 +16,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from srtomo_core.layout import Layout
 from srtomo_core.reconstructor import Reconstructor
 from srtomo_core.system import System
 from srtomo_srtc.decide import Action, Comparison, Decider, Rules, State, compare
@@ -33,23 +34,25 @@ class Belief:
 
     Attributes:
         source: where the system's sky comes from: "file", "ground" or "learned".
+        layout: where its sensors are taken to be; None: as in the system.
     """
 
     source: str
     system: System
     reconstructor: Reconstructor
+    layout: Layout | None = None
     models: dict[int, SlopeModel] = field(default_factory=dict)
 
     def model(self, ahead: int) -> SlopeModel:
         """What the system supposes of the slopes; with ``ahead``, also of how many exposures later."""
         if ahead not in self.models:
-            self.models[ahead] = model_of(self.system, ahead)
+            self.models[ahead] = model_of(self.system, ahead, self.layout)
         return self.models[ahead]
 
 
-def model_of(system: System, ahead: int) -> SlopeModel:
+def model_of(system: System, ahead: int, layout: Layout | None = None) -> SlopeModel:
     """As :meth:`Belief.model`."""
-    return FlowModel(system, ahead / system.loop.rate) if ahead else SlopeModel(system)
+    return FlowModel(system, ahead / system.loop.rate, layout) if ahead else SlopeModel(system, layout)
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,21 +70,22 @@ class LearnedSky:
     winds: tuple[LayerWind, ...] = ()
 
 
-def learned_sky(system: System, window: Statistics, *, winds: bool = False) -> LearnedSky:
+def learned_sky(system: System, window: Statistics, *, winds: bool = False, layout: Layout | None = None) -> LearnedSky:
     """Fit a window.
 
     Args:
         system: the instrument as its file says.
         winds: learn them too; each is believed as far as it is known, and where it is not seen as the file has it.
+        layout: where sensors are taken to be; as in the system when not given.
 
     Raises:
         LearnError: no sky can be told from it.
     """
-    learned = learn(system, window)
-    believed = learned.system(system)
+    learned = learn(system, window, layout=layout)
+    believed = learned.system(system, layout=layout)
     if not winds:
         return LearnedSky(learned, believed)
-    found = learn_winds(believed, window)
+    found = learn_winds(believed, window, layout)
     believed = with_trusted_winds(with_winds(believed, found), [0.0 if wind.reason else wind.sigma for wind in found])
     return LearnedSky(learned, believed, found)
 
@@ -187,6 +191,7 @@ class Learner:
         clock: s; a monotonic one.
         ahead: exposures; models are judged by how well they foretell frames so much later. Of predictive
             reconstructors: single frames say nothing of the wind. 0: by single frames.
+        layout: where sensors are taken to be, by fit and build too; as in the system when not given.
     """
 
     def __init__(
@@ -197,8 +202,10 @@ class Learner:
         rules: Rules | None = None,
         clock: Callable[[], float] = time.monotonic,
         ahead: int = 0,
+        layout: Layout | None = None,
     ) -> None:
         self._fit = fit
+        self._layout = layout
         self._build = build
         self._ahead = ahead
         self._sensors = [sensor.name for sensor in system.sensors]
@@ -296,7 +303,7 @@ class Learner:
                 judgement.sky = self._fit(judgement.window)
                 system = judgement.sky.system
             with _timed(judgement, "comparison"):
-                model = model_of(system, self._ahead)
+                model = model_of(system, self._ahead, self._layout)
                 comparison = judgement.comparison = self._compared(model, active.model(self._ahead), held)
         except (ValueError, np.linalg.LinAlgError) as error:
             return judgement.ended(Outcome.FAILED, f"no candidate: {error}")
@@ -304,10 +311,11 @@ class Learner:
         if preference.action is not Action.COMMIT:
             return judgement.ended(Outcome.KEPT, preference.reason)
         with _timed(judgement, "reconstructor"):
-            candidate = Belief("learned", system, self._build(system), {self._ahead: model})
+            candidate = Belief("learned", system, self._build(system), self._layout, {self._ahead: model})
         with _timed(judgement, "prediction"):
             two = active.reconstructor, candidate.reconstructor
-            prediction = Prediction(system, epochs=max(reconstructor.n_epochs for reconstructor in two))
+            epochs = max(reconstructor.n_epochs for reconstructor in two)
+            prediction = Prediction(system, self._layout, epochs=epochs)
             before, after = (mean_wfe(prediction.budgets(reconstructor.R)) for reconstructor in two)
         judgement.predicted = before, after
         decision = self.decider.gains(preference, before, after)

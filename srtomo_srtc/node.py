@@ -21,6 +21,7 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from types import FrameType
 from typing import Any, get_args
 
@@ -49,6 +50,7 @@ from srtomo_srtc.learner import Belief, Judgement, Learner, Outcome, lags_of, le
 from srtomo_srtc.listener import Listener
 from srtomo_srtc.model import ground_prior
 from srtomo_srtc.reconstructors import implicit, predictive
+from srtomo_srtc.registration import registered_layout, with_places
 from srtomo_srtc.report import believed_fields, diagnosis, health_fields, learned_fields
 from srtomo_srtc.telemetry import COUNTED_RATE, Statistics, Telemetry
 from srtomo_srtc.wind import effective_lag
@@ -70,6 +72,7 @@ _PARAMETERS: tuple[tuple[str, Any, str], ...] = (
     ("priors", ["file"], f"reconstructors to build at the start, by prior: {', '.join(PRIORS)}"),
     ("method", "implicit", f"of all reconstructors: {', '.join(METHODS)}"),
     ("interaction_matrix", "", "path of the calibrated interaction matrix (srtomo calibrate); empty: the model's own"),
+    ("registration", "", "path of where the sensors were found (srtomo register --json); empty: as in the instrument"),
     ("closures", "singles", f"what is built for when lasers are closed: {', '.join(get_args(Closures))}"),
     ("learn", False, "learn the sky from telemetry, and publish reconstructors that are better by it"),
     ("auto_commit", False, "commit what was learned, and roll back what proves worse; false: leave that to operators"),
@@ -145,14 +148,19 @@ class SrtcNode(Node):
                 f"parameter closures: expected one of {', '.join(get_args(Closures))}, got {values['closures']!r}"
             )
         system = load_system(values["system"], json.loads(values["changes"]))
-        method = self._method = partial(METHODS[values["method"]], closures=self._that_fit(system, values["closures"]))
+        places = Path(values["registration"]) if values["registration"] else None
+        try:
+            self._layout, self._places = registered_layout(places, system)
+        except ValueError as error:
+            raise InstrumentError(f"parameter registration: {error}") from None
+        self._method = partial(METHODS[values["method"]], closures=self._that_fit(system, values["closures"]))
         G = None
         for prior in values["priors"]:
             if prior not in PRIORS:
                 raise InstrumentError(f"parameter priors: expected some of {', '.join(PRIORS)}, got {prior!r}")
             believed = PRIORS[prior](system)
-            reconstructor, G = method(believed, label=prior)
-            self._built[prior] = Belief(prior, believed, reconstructor)
+            reconstructor, G = self._reconstructor(believed, prior)
+            self._built[prior] = Belief(prior, believed, reconstructor, self._layout)
             self.get_logger().info(f"built {prior}: {reconstructor.id:016x}")
         if values["learn"]:
             if values["interaction_matrix"]:
@@ -164,6 +172,11 @@ class SrtcNode(Node):
                 raise InstrumentError("parameter priors: expected at least one to begin learning with")
             self._begin_learning(system, G, values)
         self.create_service(PublishReconstructor, "srtc/publish", self._publish)
+
+    def _reconstructor(self, believed: System, label: str, **keywords: Any) -> tuple[Reconstructor, Any]:
+        """By the method, for the places that the sensors are in; with its interaction matrix."""
+        reconstructor, G = self._method(believed, self._layout, label=label, **keywords)
+        return with_places(reconstructor, self._places), G
 
     def _that_fit(self, system: System, closures: Closures) -> Closures:
         """The same, or the low order alone where they would take more memory than they may."""
@@ -257,21 +270,21 @@ class SrtcNode(Node):
     # -- learning ---------------------------------------------------------------------------------------------------
 
     def _begin_learning(self, system: System, G: Any, values: dict[str, Any]) -> None:
-        method, predicts = self._method, values["method"] == "predictive"
+        layout, predicts = self._layout, values["method"] == "predictive"
         rules = Rules(
             floor=values["floor"] * 1e-9, every=values["every"], watch=2 * values["window"], pause=values["pause"]
         )
         every = max(1, round(system.loop.rate / COUNTED_RATE))
-        telemetry = Telemetry(
-            system, G, window=values["window"], every=every, lags=lags_of(system, every) if predicts else ()
-        )
+        lags = lags_of(system, every) if predicts else ()
+        telemetry = Telemetry(system, G, layout=layout, window=values["window"], every=every, lags=lags)
         frames_ahead = effective_lag(system.loop) * system.loop.rate
         learner = Learner(
             system,
-            partial(learned_sky, system, winds=predicts),
-            lambda believed: method(believed, label=_LEARNED, fast=True)[0],
+            partial(learned_sky, system, winds=predicts, layout=layout),
+            lambda believed: self._reconstructor(believed, _LEARNED, fast=True)[0],
             rules,
             ahead=every * max(1, round(frames_ahead / every)) if predicts else 0,
+            layout=layout,
         )
         for belief in self._built.values():
             learner.know(belief)
@@ -346,6 +359,8 @@ class SrtcNode(Node):
 
     def _give_order(self, order: _Order) -> None:
         if self._auto_commit:
+            if self._order is not None:
+                self._told(2, f"could not {self._order.text}: the HRTC does not hold it")
             self._order = order
         else:
             self.get_logger().info(f"auto_commit is off: to {order.text} is the operator's")

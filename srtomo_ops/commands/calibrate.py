@@ -9,9 +9,9 @@ from typing import Any
 from srtomo_core.layout import Layout
 from srtomo_core.reconstructor import save_interaction_matrix
 from srtomo_core.system import System
-from srtomo_ops.options import add_json, add_system, system_of, writable_file, write_json
-from srtomo_ops.registration import add_registration, registered_layout
+from srtomo_ops.options import add_json, add_registration, add_system, system_of, writable_file, write_json
 from srtomo_sim.mirror import interaction_matrix
+from srtomo_srtc.registration import registered_layout
 
 EXAMPLE = "example:\n  srtomo calibrate gnao_ltao_sr -o gnao_gcal.npz"
 

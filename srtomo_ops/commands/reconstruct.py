@@ -8,17 +8,24 @@ import json
 import textwrap
 import time
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from types import UnionType
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
-from srtomo_ops.options import add_json, add_system, assignments, system_of, writable_file, write_json
+from srtomo_ops.options import (
+    add_json,
+    add_registration,
+    add_system,
+    assignments,
+    system_of,
+    writable_file,
+    write_json,
+)
 from srtomo_ops.progress import Progress
-from srtomo_ops.registration import add_registration, registered_layout
 from srtomo_srtc.measured import read_measured
 from srtomo_srtc.model import ground_prior
 from srtomo_srtc.reconstructors import METHODS
+from srtomo_srtc.registration import registered_layout, with_places
 
 _SHARED = ("system", "layout", "label", "progress")  # parameters that have options of their own, or none
 
@@ -168,8 +175,7 @@ def main(options: argparse.Namespace) -> int:
             believed, layout, label=options.label or options.prior, progress=progress.stage, **keywords
         )
     seconds = time.perf_counter() - start
-    if registration:
-        reconstructor = replace(reconstructor, provenance={**reconstructor.provenance, "registration": registration})
+    reconstructor = with_places(reconstructor, registration)
     reconstructor.save(options.output, G)
     exposures = f" of {reconstructor.n_epochs} exposures" if reconstructor.n_epochs > 1 else ""
     print(

@@ -18,7 +18,6 @@ from srtomo_core.reconstructor import load_interaction_matrix
 from srtomo_core.system import System, load_system
 from srtomo_ops.options import add_json, assignments, write_json
 from srtomo_ops.progress import Progress
-from srtomo_ops.registration import registration_content
 from srtomo_srtc.matching import Matched, Matcher
 from srtomo_srtc.register import (
     MIN_STRETCHES,
@@ -28,6 +27,7 @@ from srtomo_srtc.register import (
     from_interaction_matrix,
     from_telemetry,
 )
+from srtomo_srtc.registration import registration_content
 
 EXAMPLE = """examples:
   srtomo register night1                                        from closed-loop telemetry, 15 s or more of it

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from srtomo_core.layout import Layout
 from srtomo_core.reconstructor import Reconstructor
 from srtomo_core.system import System, load_system
 from srtomo_core.wire import DmCommandWriter, SlopeFrameWriter
@@ -23,7 +24,7 @@ from srtomo_sim.plant import Plant
 from srtomo_sim.shack_hartmann import noise_sigma
 from srtomo_sim.sky import Sky, prepare
 from srtomo_srtc.decide import Action, Decider, Decision, Rules
-from srtomo_srtc.health import Health
+from srtomo_srtc.health import Health, SlopeModel
 from srtomo_srtc.learn import LearnError
 from srtomo_srtc.learner import (
     Belief,
@@ -37,6 +38,7 @@ from srtomo_srtc.learner import (
     learned_sky,
 )
 from srtomo_srtc.reconstructors import implicit, predictive
+from srtomo_srtc.register import moved_sensors
 from srtomo_srtc.telemetry import Statistics, Telemetry
 
 Spoil = Callable[[int, NDArray[np.float32]], "NDArray[np.float32] | None"]
@@ -132,7 +134,7 @@ def run(
     layout, rate = sky.layout, system.loop.rate
     frame = 0
     telemetry = Telemetry(system, interaction_matrix(system, layout), window=window, lags=lags)
-    learner = Learner(system, fit or _never, build, rules, lambda: frame / rate, ahead)
+    learner = Learner(system, fit or _never, build, rules, lambda: frame / rate, ahead, belief.layout)
     learner.know(belief)
     settings = replace(plain_settings(layout), command_limit=limit)
     programs = {belief.reconstructor.id: program_of(layout, belief.reconstructor, settings)}
@@ -237,6 +239,26 @@ def test_it_takes_up_what_is_better(mini: System, file: Belief, sky: Sky) -> Non
     after = 1050
     regained = never.rms(after) - learns.rms(after)
     assert regained > 0.9 * (never.rms(after) - told.rms(after)) > 0.5
+
+
+def test_it_learns_where_sensors_were_registered(mini: System) -> None:
+    """A plant whose sensors are moved: loop's and candidate's models are right there, and so is the learned sky."""
+    layout = Layout(mini)
+    moves = np.zeros((len(layout.sensors), 4))
+    moves[:3, :2] = np.array([[0.4, -0.2], [-0.3, 0.4], [-0.3, -0.4]]) * layout.sensors[0].size
+    there = moved_sensors(mini, layout, moves)
+    sky = prepare(mini, 1000, seed=3, layout=there, science_every=50)
+    belief = Belief("file", mini, implicit(mini, there)[0], there)
+    fit = partial(learned_sky, mini, layout=there)
+    session = run(Plant(mini, sky), belief, fit, window=4.0, rules=RULES)
+    ((_, judgement),) = session.judgements
+    assert judgement.health is not None and judgement.comparison is not None and judgement.sky is not None
+    held = judgement.window.held_out
+    elsewhere = Health.of(SlopeModel(mini).scores(held.slopes), held.block).innovation.mean
+    assert elsewhere[:3].min() > 2
+    assert judgement.health.innovation.mean[:3] == pytest.approx(np.ones(3), abs=0.05)
+    assert judgement.comparison.candidate.innovation.mean[:3] == pytest.approx(np.ones(3), abs=0.1)
+    assert judgement.sky.learned.r0 == pytest.approx(mini.atmosphere.r0, rel=0.05)
 
 
 def test_a_failed_fit_changes_nothing(mini: System, file: Belief, sky: Sky) -> None:

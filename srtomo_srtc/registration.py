@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from srtomo_core.layout import Layout
+from srtomo_core.reconstructor import Reconstructor
 from srtomo_core.system import System
 from srtomo_srtc.register import Registration, moved_sensors
 
@@ -35,16 +36,6 @@ def registration_content(system: System, layout: Layout, found: Registration, ho
         row |= {"displacement_subaperture": place.displacement, "displacement_sigma": place.displacement_sigma}
         rows.append(row)
     return {"system": system.name, "fingerprint": layout.fingerprint.hex(), "from": how, "sensors": rows}
-
-
-def add_registration(parser: argparse.ArgumentParser) -> None:
-    """``--registration FILE``."""
-    parser.add_argument(
-        "--registration",
-        metavar="FILE",
-        type=Path,
-        help="sensors where 'srtomo register --json FILE' found them; slopes, commands and fingerprint stay",
-    )
 
 
 def registered_layout(path: Path | None, system: System) -> tuple[Layout, dict[str, Any]]:
@@ -83,3 +74,10 @@ def registered_layout(path: Path | None, system: System) -> tuple[Layout, dict[s
         if not (np.isfinite(sensor.illumination).all() and sensor.illumination.min() > 0):
             raise ValueError(f"{path}: sensor {sensor.name}: so far away that a sub-aperture gets no light")
     return there, content
+
+
+def with_places(reconstructor: Reconstructor, content: dict[str, Any]) -> Reconstructor:
+    """The reconstructor with what the file says in its provenance, if there was one."""
+    if not content:
+        return reconstructor
+    return replace(reconstructor, provenance={**reconstructor.provenance, "registration": content})
