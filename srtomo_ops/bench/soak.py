@@ -206,8 +206,12 @@ def soak(
     _compare_records(recorded, check)
     swaps = [(0, matrices.good[0].id), *map(tuple, told["swaps"])]
     # a swap after the last frame made no command
-    if check.swaps != [swap for swap in swaps if swap[0] < frames]:
-        raise SoakError(f"commands changed their reconstructor at {check.swaps[:5]}..., the HRTC told {swaps[:5]}...")
+    made, announced = set(check.swaps), {swap for swap in swaps if swap[0] < frames}
+    if made != announced:
+        raise SoakError(
+            f"changes of reconstructor, (first frame, id): made but not told {sorted(made - announced)[:3]}, "
+            f"told but not made {sorted(announced - made)[:3]}"
+        )
     contrast = check.contrast()
     if contrast < _CONTRAST * TOLERANCE:
         raise SoakError(f"a mixture might differ by {contrast:.1e} only: it would not have been noticed")
