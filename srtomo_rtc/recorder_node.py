@@ -62,9 +62,10 @@ _STATUS_PERIOD = 0.5  # s
 _FLUSH_PERIOD = 1.0  # s: what a killed recorder loses at the most, when messages are rare
 _UNMATCHED_STATUSES = 4  # in a row: after 2 s a publisher in the graph is not merely being discovered
 _IN_FLIGHT = 0.1  # s from a sensor to here that is no loss when a recording starts or stops in between
-_LAST_MESSAGES = 0.1  # s that messages already sent get to arrive after the order to stop
+_LAST_MESSAGES = 0.3  # s that messages already sent get to arrive after the order to stop
 _WAITING_BYTES = 256 << 20  # for the disk; beyond it messages wait in the readers' queues
 _OVERLAP = 1.0  # s after a change between ring and subscriptions for which both are taken from
+_GRACE = 100_000_000  # ns that a message from a subscription waits for its copy in the ring, which has the better time
 _REMEMBERED = 10  # queues' worth of messages, which may come by both
 _QUIET = 0.25  # s without a message in the ring after which the subscriptions are looked at too
 _RING_CHANNELS = (SLOPES, COMMAND)
@@ -218,6 +219,7 @@ class Recorder:
         self._ring_wanted = bool(self._hot)
         self._heard = -math.inf  # when something last came from the ring
         self._changed = -math.inf  # when ring and subscriptions last took over from each other
+        self._waiting: list[_Record] = []  # from subscriptions, until the ring was read after their grace
         self._unrecorded: list[str] = []
         self._scribe = _Scribe(bag)
         self._scribe.start()
@@ -268,13 +270,21 @@ class Recorder:
             self._drain(self._taps)
 
     def _drain(self, taps: Sequence[_Tap]) -> bool:
+        graceful = self._clock.start + time.monotonic_ns() - _GRACE  # before the ring is read
         batch = self._take_ring()
         since_change = time.monotonic() - self._changed
         for tap in taps:
             if tap.topic in _RING_CHANNELS and self._ring.attached and since_change > _OVERLAP:
                 continue  # stands by
             with tap.subscription.handle:
-                batch += [record for record in tap.take() if self._is_news(record, _SUBSCRIPTION)]
+                taken = list(tap.take())
+            if tap.topic in _RING_CHANNELS:
+                self._waiting += taken
+            else:
+                batch += taken
+        due = [record for record in self._waiting if record.received < graceful or not self._ring.attached]
+        self._waiting = [record for record in self._waiting if record.received >= graceful and self._ring.attached]
+        batch += [record for record in due if record.tap.recent.add(record.data, _SUBSCRIPTION)]
         batch.sort(key=itemgetter(0))
         if not batch:
             return False
@@ -282,11 +292,6 @@ class Recorder:
             self._book(record)
         self._scribe.give(batch)
         return True
-
-    @staticmethod
-    def _is_news(record: _Record, way: int) -> bool:
-        """False for one that has come by the other way, if there are two."""
-        return record.tap.topic not in _RING_CHANNELS or record.tap.recent.add(record.data, way)
 
     def _take_ring(self) -> list[_Record]:
         before = self._ring.attached, self._ring.overruns
@@ -304,7 +309,7 @@ class Recorder:
             if tap is not None:
                 received = self._clock.start + arrived
                 batch.append(_Record(received, tap, data, received, 0))
-        return [record for record in batch if self._is_news(record, _RING)]
+        return [record for record in batch if record.tap.recent.add(record.data, _RING)]
 
     def _book(self, record: _Record) -> None:
         record.tap.recorded += 1
