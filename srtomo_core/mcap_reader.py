@@ -105,6 +105,7 @@ class McapReader:
         self.schemas: dict[int, Schema] = {}
         self.channels: dict[int, Channel] = {}
         self._profile: str | None = None
+        self._indexed_to = -1  # where the newest chunk, with its index so far, ends
         self._stated_count: int | None = None  # messages, by the file's own statistics
         try:
             self._file: IO[bytes] = open(path, "rb")
@@ -162,7 +163,10 @@ class McapReader:
         if opcode == Opcode.CHUNK:
             first, last = _CHUNK_TIMES.unpack(self._file.read(_CHUNK_TIMES.size))
             self._segments.append(_Segment(start, end, True, first, last))
-        elif opcode == Opcode.MESSAGE_INDEX and self._segments:
+            self._indexed_to = end
+        elif opcode == Opcode.MESSAGE_INDEX and start == self._indexed_to:
+            # of the chunk right before: that of a chunk which is none any more must not count for another
+            self._indexed_to = end
             channel, length = _INDEX.unpack(self._file.read(_INDEX.size))
             self._segments[-1].counts[channel] += length // _INDEX_ENTRY_BYTES
         elif opcode in _LOOSE:

@@ -45,11 +45,12 @@ def coarse_harmoni(subapertures: int, read_noise: float) -> System:
 
 
 def with_variances(system: System, lasers: Callable[[np.ndarray], np.ndarray], folder: Path) -> System:
-    """x and y supposed to be independent; of the lasers' true variances (sensors, 2, sub-apertures) what to suppose."""
+    """x and y supposed to be independent; of the lasers' true variances (2, all sub-apertures) what to suppose."""
     layout = Layout(system)
     N = noise_covariance(system, layout, 1.0).diagonal()
     blind = [w for w, sensor in enumerate(system.sensors) if system.star_of(sensor).kind == "laser"]
-    supposed = lasers(np.array([N[layout.slopes_of(w)].reshape(2, -1) for w in blind]))
+    true = [N[layout.slopes_of(w)].reshape(2, -1) for w in blind]
+    supposed = np.split(lasers(np.hstack(true)), np.cumsum([part.shape[1] for part in true])[:-1], axis=1)
     changes = {}
     for w, variances in zip(blind, supposed, strict=True):
         file = folder / f"{system.sensors[w].name}.npz"
@@ -60,7 +61,7 @@ def with_variances(system: System, lasers: Callable[[np.ndarray], np.ndarray], f
 
 DIAGONALS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "own": lambda N: N,
-    "mean of x and y": lambda N: N.mean(axis=1, keepdims=True) + 0 * N,
+    "mean of x and y": lambda N: N.mean(axis=0, keepdims=True) + 0 * N,
     "one for all": lambda N: N.mean() + 0 * N,
 }
 """What a diagonal prior may take from the true variances; one more is that of compact spots."""
