@@ -477,16 +477,21 @@ class HrtcNode(LifecycleNode):
             self._begin(self._manifest)
 
     def _begin(self, manifest: Manifest) -> None:
-        assert self._swap is not None
-        known = (self._swap.active, self._swap.staged)
-        if any(held is not None and held.slot.sha256 == manifest.sha256 for held in known):
-            # a late repetition of what is here already
-            self._worker.submit(self._swap.forget)
-        else:
-            self._last_block = self._resend_asked = time.monotonic()
-            self._watch(self._worker.submit(self._swap.begin, manifest), manifest)
-            for block in self._early_blocks:
-                self._take(block)
+        swap = self._swap
+        assert swap is not None
+
+        def begin() -> None:
+            # asked on the worker's thread: the same one may be just being staged
+            known = (swap.active, swap.staged)
+            if any(held is not None and held.slot.sha256 == manifest.sha256 for held in known):
+                swap.forget()  # a late repetition of what is here already
+            else:
+                swap.begin(manifest)
+
+        self._last_block = self._resend_asked = time.monotonic()
+        self._watch(self._worker.submit(begin), manifest)
+        for block in self._early_blocks:
+            self._take(block)
         self._early_blocks.clear()
 
     def _on_block(self, data: bytes) -> None:
