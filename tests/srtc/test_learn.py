@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
+from scipy.linalg import null_space
 
 from srtomo_core.layout import Layout
 from srtomo_core.system import System, load_system
@@ -73,6 +75,61 @@ def drawn(C: np.ndarray, n_frames: int, seed) -> np.ndarray:
     draw = np.random.default_rng(seed).standard_normal((len(C), n_frames))
     frames = (vectors * np.sqrt(np.maximum(values, 0))) @ draw
     return frames @ frames.T / n_frames
+
+
+@dataclass(frozen=True, eq=False)
+class Night:
+    """A sky drawn far from the file's; its covariance is the model's own, so that chance alone is left."""
+
+    r0: float
+    outer_scale: float
+    strengths: np.ndarray
+    levels: np.ndarray
+    covariance: np.ndarray
+
+    @classmethod
+    def of(cls, system: System, model: SkyModel, number: int) -> Night:
+        draw = np.random.default_rng([7, number])
+        r0, fractions, levels = draw.uniform(0.08, 0.25), draw.dirichlet([2, 2, 2]), draw.uniform(0.5, 3, 3)
+        outer_scale = math.exp(draw.uniform(math.log(10), math.log(60)))
+        strengths = (r0 * math.cos(system.zenith_angle) ** 0.6) ** (-5 / 3) * fractions
+        C = model.turbulence(strengths, outer_scale).astype(float)
+        C += sum(level * noise for level, noise in zip(levels, model.noise))
+        return cls(r0, outer_scale, strengths, levels, C)
+
+    @property
+    def fractions(self) -> np.ndarray:
+        return self.strengths / self.strengths.sum()
+
+    def drawn(self, number: int, n_frames: int) -> np.ndarray:
+        return drawn(self.covariance, n_frames, [8, number])
+
+    def best_possible(self, model: SkyModel, S: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """What no estimator is better than to first order: one step of scoring from the truth itself.
+
+        Its errors ``J F^-1 g`` have the covariance ``J F^-1 J^T / n_frames`` exactly (the Cramer-Rao bound).
+
+        Returns:
+            (8,) errors of log r0, the fractions, L0^-1.5 and the noise levels under the second moment ``S``; (8, 8)
+            their covariance from one frame.
+        """
+        seen = null_space(model.sampling.blind.T)
+        near, far = self.outer_scale / 1.01, self.outer_scale * 1.01
+        slope = model.turbulence(self.strengths, near).astype(float) - model.turbulence(self.strengths, far)
+        slope /= near**-1.5 - far**-1.5
+        bases = [*(model.layer(l, self.outer_scale) for l in range(3)), slope, *model.noise]
+        C = seen.T @ self.covariance @ seen
+        whitened = [np.linalg.solve(C, seen.T @ basis @ seen) for basis in bases]
+        F = 0.5 * np.array([[np.sum(a * b.T) for a in whitened] for b in whitened])
+        excess = np.linalg.solve(C, seen.T @ S @ seen) - np.eye(len(C))
+        g = 0.5 * np.array([np.sum(basis * excess.T) for basis in whitened])
+        total = self.strengths.sum()
+        J = np.zeros((8, 7))
+        J[0, :3] = -0.6 / total
+        J[1:4, :3] = (np.eye(3) - self.fractions[:, None]) / total
+        J[4:, 3:] = np.eye(4)
+        inverse = np.linalg.inv(F)
+        return J @ inverse @ g, J @ inverse @ J.T
 
 
 # --- likelihood -----------------------------------------------------------------------------------------------------
@@ -257,26 +314,55 @@ def test_an_outer_scale_that_is_not_seen_has_no_upper_end(system: System) -> Non
     assert math.isinf(high)
 
 
+def test_stated_errors_are_the_cramer_rao_bound(system: System) -> None:
+    # no chance: the second moment is the covariance itself
+    layout = Layout(system)
+    model = SkyModel(system, layout, Sampling.of(system, layout, 2000), ALTITUDES * system.airmass)
+    for number in range(4):
+        night = Night.of(system, model, number)
+        told = learn(system, statistics(night.covariance, 300), altitudes=ALTITUDES)
+        low, high = (scale**-1.5 for scale in told.outer_scale_range)
+        stated = [told.r0_sigma / told.r0, *(group.sigma for group in told.groups), (low - high) / 2]
+        stated += [level.sigma for level in told.noise]
+        _, covariance = night.best_possible(model, night.covariance)
+        ratio = stated / np.sqrt(np.diag(covariance) / 300)
+        # the outer scale's derivative is a difference to one side, taken before the last step
+        assert ratio[:4] == pytest.approx(np.ones(4), abs=0.02)
+        assert ratio[4] == pytest.approx(1, abs=0.05)
+        assert ratio[5:] == pytest.approx(np.ones(3), abs=0.002)
+
+
+def test_what_is_told_is_the_best_that_these_frames_allow(system: System) -> None:
+    # the best possible estimate has luck of its own: apart from it by little of its error, whatever that luck
+    layout = Layout(system)
+    model = SkyModel(system, layout, Sampling.of(system, layout, 2000), ALTITUDES * system.airmass)
+    for number in range(6):
+        night = Night.of(system, model, number)
+        S = night.drawn(number, 300)
+        told = learn(system, statistics(S, 300), altitudes=ALTITUDES)
+        wrong, covariance = night.best_possible(model, S)
+        sigma = np.sqrt(np.diag(covariance) / 300)[:4]
+        apart = np.array([math.log(told.r0 / night.r0), *(told.fractions - night.fractions)]) - wrong[:4]
+        assert np.abs(apart / sigma).max() < 0.2
+        stated = [told.r0_sigma / told.r0, *(group.sigma for group in told.groups)]
+        # they are those of the sky as it is told, so that they have a little luck too
+        assert stated == pytest.approx(sigma, rel=0.08)
+
+
 @pytest.mark.slow
 def test_400_nights_are_calibrated(system: System) -> None:
     # of truths drawn far from the file's, how many lie within the stated 1-sigma interval
     layout = Layout(system)
     model = SkyModel(system, layout, Sampling.of(system, layout, 2000), ALTITUDES * system.airmass)
     within: dict[str, list[bool]] = {"r0": [], "0 m": [], "3000 m": [], "10000 m": [], "noise": [], "outer scale": []}
-    for night in range(400):
-        draw = np.random.default_rng([7, night])
-        r0, fractions, levels = draw.uniform(0.08, 0.25), draw.dirichlet([2, 2, 2]), draw.uniform(0.5, 3, 3)
-        outer_scale = math.exp(draw.uniform(math.log(10), math.log(60)))
-        los = r0 * math.cos(system.zenith_angle) ** 0.6
-        C = model.turbulence(los ** (-5 / 3) * fractions, outer_scale).astype(float)
-        C += sum(level * noise for level, noise in zip(levels, model.noise))
-        S = drawn(C, 300, [8, night])
-        told = learn(system, statistics(S, 300), altitudes=ALTITUDES)
-        within["r0"].append(abs(told.r0 - r0) < told.r0_sigma)
-        for name, group, fraction in zip(("0 m", "3000 m", "10000 m"), told.groups, fractions, strict=True):
+    for number in range(400):
+        night = Night.of(system, model, number)
+        told = learn(system, statistics(night.drawn(number, 300), 300), altitudes=ALTITUDES)
+        within["r0"].append(abs(told.r0 - night.r0) < told.r0_sigma)
+        for name, group, fraction in zip(("0 m", "3000 m", "10000 m"), told.groups, night.fractions, strict=True):
             within[name].append(abs(group.fraction - fraction) < group.sigma)
-        within["noise"] += [abs(n.factor - levels[n.sensor]) < n.sigma for n in told.noise]
-        within["outer scale"].append(told.outer_scale_range[0] < outer_scale < told.outer_scale_range[1])
+        within["noise"] += [abs(n.factor - night.levels[n.sensor]) < n.sigma for n in told.noise]
+        within["outer scale"].append(told.outer_scale_range[0] < night.outer_scale < told.outer_scale_range[1])
     share = {name: float(np.mean(hits)) for name, hits in within.items()}
     print("\n" + "\n".join(f"{name:<12} {100 * value:5.1f} % of {len(within[name])}" for name, value in share.items()))
     for name in ("r0", "0 m", "3000 m", "10000 m"):
