@@ -114,6 +114,8 @@ class _FileWriter:
         os.fsync(self._file.fileno())
         self._file.close()
         self._final_bytes = os.path.getsize(self.path)
+        # it holds an index of the whole file, and a recording without an end has files without end
+        del self._writer
 
     def abort(self) -> None:
         # closing writes what is buffered, and so fails again on a full disk

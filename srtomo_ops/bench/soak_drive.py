@@ -8,6 +8,7 @@ Bad reconstructors are sent in between.
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import signal
 import time
@@ -100,17 +101,18 @@ class Swapping:
     """
 
     def __init__(self, operator: Operator, good: list[Reconstructor], bad: Reconstructor) -> None:
-        self._operator, self._good, self._bad = operator, good, bad
+        self._operator, self._bad = operator, bad
+        self._turns = itertools.cycle(good)
         self._sending = Sending(operator, bad.n_commands)
         self._clients = {
             name: operator.create_client(SwapReconstructor, f"hrtc/{name}") for name in ("commit", "roll_back")
         }
         self._active, self._previous = good[0], good[0]
-        self._coming = good[1]
+        self._coming = good[0]
         self._sent = False  # what comes is on its way, or there
         self._under_way: tuple[Future, Reconstructor] | None = None
         self._number = 0
-        self._next_good, self._next_bad = 1, 0
+        self._next_bad = 0
         self.told: list[tuple[int, int]] = []
         self.transfers = self.refused = 0
         self._transfer()
@@ -128,16 +130,29 @@ class Swapping:
         """Whether what was sent to be refused was."""
         return self._status("reconstructors_refused") >= self.refused
 
+    @property
+    def all_come(self) -> bool:
+        """Whether what was sent to be used is there."""
+        return not self._sent or self.staged
+
     def _transfer(self) -> None:
-        self._coming = self._good[self._next_good]
-        self._next_good = (self._next_good + 1) % len(self._good)
+        # the HRTC takes what it has for a repetition, and would not stage it; what comes may be under way to be used
+        has = {self._active.id, self._previous.id, self._coming.id}
+        self._coming = next(one for one in self._turns if one.id not in has)
         self._sending.send(self._coming)
+        self._sent_at = time.monotonic()
         self._sent = True
         self.transfers += 1
 
     def begin(self) -> None:
-        """Ask for the next swap; the one before must be done."""
+        """Ask for the next swap; the one before must be done.
+
+        Raises:
+            ValueError: a reconstructor that was sent long ago has not come.
+        """
         assert self._under_way is None
+        if not self.all_come and time.monotonic() > self._sent_at + _PATIENCE:
+            raise ValueError(f"reconstructor {self._coming.id:016x}: sent, but not staged within {_PATIENCE:g} s")
         if self.staged:
             self._call("commit", self._coming)
             self._sent = False
@@ -276,6 +291,7 @@ class Driver:
                     late = []
             self._wait_answered(plan.frames - 1)
         self.wait_for(swapping.done, "the last swap")
+        self.wait_for(lambda: swapping.all_come, "the last reconstructor staged")
         self.wait_for(lambda: swapping.all_refused, "bad reconstructors refused")
 
     def status_after(self, frame: int) -> dict[str, Any]:
