@@ -11,7 +11,8 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -31,8 +32,8 @@ from srtomo_sim.mirror import interaction_matrix
 Floats = NDArray[np.float64]
 
 ARRIVALS = ("staggered", "burst")
-TARGETS = {"staggered": 0.35, "burst": 1.1, "int16": 0.65}
-"""Largest median allowed, in sgemv's: the loop's compute in both ways of arrival, and the int16 kernel alone."""
+TARGETS = {"staggered": 0.35, "burst": 1.1, "burst_int16": 0.65}
+"""Largest median allowed, in sgemv's: the loop's compute in both ways of arrival, and in a burst with kernel int16."""
 
 PATH_TARGETS = {"staggered": 0.5, "burst": 1.0}
 """What the whole path may take more than an echo's, median and p90, in sgemv's."""
@@ -211,9 +212,16 @@ class Problem:
         packets = burst(self.layout) if arrival == "burst" else staggered(self.layout, self.packets)
         return Sensors(self.layout, self.system.loop.rate, packets, self.slopes)
 
-    def reference(self) -> Reference:
-        """The commands to expect, from frame 0 with the loop closed."""
-        return Reference(self.system, self.reconstructor, self.slopes)
+    def reference(self, kernel: str = "float32") -> Reference:
+        """The commands to expect, from frame 0 with the loop closed, of R as the kernel holds it."""
+        reconstructor = self.reconstructor
+        if kernel == "int16":
+            held = reconstructor.R.copy()
+            for w in range(len(self.layout.sensors)):
+                integers, scales = quantise(held[0, :, self.layout.slopes_of(w)])
+                held[0, :, self.layout.slopes_of(w)] = integers * scales[:, None]
+            reconstructor = replace(reconstructor, R=held)
+        return Reference(self.system, reconstructor, self.slopes)
 
 
 class Summary(NamedTuple):
@@ -238,8 +246,8 @@ class Compute:
     """Compute alone, in this process.
 
     Attributes:
-        latencies: of ``sgemv`` (one product R y, numpy); ``staggered`` and ``burst`` (last message due to command
-            serialised); ``float32`` and ``int16`` (that kernel alone, over the whole of R).
+        latencies: of ``sgemv`` (one product R y, numpy); ``staggered``, ``burst`` and ``burst_int16`` (last message due
+            to command serialised); ``float32`` and ``int16`` (that kernel alone, over the whole of R).
         error: largest error of a command, of the largest of its frame.
         held: frames that the loop held because it was behind.
         int16_to_noise: see :func:`srtomo_rtc.compression.int16_to_noise`.
@@ -277,22 +285,24 @@ def measure_compute(problem: Problem, frames: int) -> Compute:
         ValueError: a command is missing or wrong, or a kernel's product is.
     """
     period = round(1e9 / problem.system.loop.rate)
-    loop = LoopHere(problem, period)
-    kernels = _kernels(problem, period)
-    samples: dict[str, list[int]] = {name: [] for name in (*ARRIVALS, *kernels)}
+    loop, loop_int16 = LoopHere(problem, period), LoopHere(problem, period, "int16")
+    measured: dict[str, Callable[[int], list[int]]] = {
+        **_kernels(problem, period),
+        **{arrival: partial(loop.run, arrival) for arrival in ARRIVALS},
+        "burst_int16": partial(loop_int16.run, "burst"),
+    }
+    samples: dict[str, list[int]] = {name: [] for name in measured}
     left = frames
     while left > 0:
         block = min(left, _BLOCK)
-        for name, kernel in kernels.items():
-            samples[name] += kernel(block)
-        for arrival in ARRIVALS:
-            samples[arrival] += loop.run(arrival, block)
+        for name, run in measured.items():
+            samples[name] += run(block)
         left -= block
     latencies = {name: Summary.of(values) for name, values in samples.items()}
     return Compute(
         latencies,
-        loop.reference.error,
-        loop.reference.held,
+        max(loop.reference.error, loop_int16.reference.error),
+        loop.reference.held + loop_int16.reference.held,
         int16_to_noise(problem.system, problem.layout, problem.reconstructor.R[0]),
     )
 
@@ -300,20 +310,19 @@ def measure_compute(problem: Problem, frames: int) -> Compute:
 class LoopHere:
     """The HRTC's frame gate and loop on this thread."""
 
-    def __init__(self, problem: Problem, period: int) -> None:
+    def __init__(self, problem: Problem, period: int, kernel: str = "float32") -> None:
         self._sensors = {arrival: problem.sensors(arrival) for arrival in ARRIVALS}
         self._period = period
         self._ready = 0
         self._commands: list[bytes] = []
         self._hrtc = Hrtc(problem.layout, problem.system.loop.delay, self._publish)
-        program = program_of(
-            problem.layout, problem.reconstructor, plain_settings(problem.layout, problem.system.loop.leak)
-        )
+        settings = plain_settings(problem.layout, problem.system.loop.leak)
+        program = program_of(problem.layout, problem.reconstructor, settings, kernel)
         program.warm()
         self._hrtc.loop.post(program)
         self._hrtc.loop.request(closed=True)
         self._hrtc.start()
-        self.reference = problem.reference()
+        self.reference = problem.reference(kernel)
 
     def _publish(self, buffer: bytes) -> None:
         self._ready = time.monotonic_ns()

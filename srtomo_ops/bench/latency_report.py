@@ -14,6 +14,7 @@ _MEANING = {
     "sgemv": "(a) one float32 product R y, numpy, one core",
     "staggered": "loop, last packet due to command ready",
     "burst": "loop, message due to command ready",
+    "burst_int16": "loop with kernel int16, message due to command ready",
     "float32": "float32 kernel alone",
     "int16": "int16 kernel alone",
 }

@@ -8,6 +8,7 @@ are the middleware's, on the system's clock, which all processes of a host share
 from __future__ import annotations
 
 import json
+import os
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -26,6 +27,7 @@ from srtomo_core.reconstructor import save_interaction_matrix
 from srtomo_ops.bench.latency import ARRIVALS, Problem, Sensors, Summary, wait_until
 from srtomo_ops.operator import Operator
 from srtomo_ops.processes import Processes
+from srtomo_rtc import realtime
 
 WARM_UP = 20
 """First frames of each turn that are checked and not counted (or a fifth of the turn, if that is less)."""
@@ -217,8 +219,9 @@ def measure_paths(
             operator.close_loop(True)
             for end in ends.values():
                 end.wait_matched()
+            _listen_at(fifo_priority)
             operator.spin(0.3)  # statuses, and the other side's part of discovery
-            realtime = operator.hrtc.realtime if operator.hrtc is not None else ""
+            settings = operator.hrtc.realtime if operator.hrtc is not None else ""
             reference = problem.reference()
             log = _Log()
             sensors = {arrival: problem.sensors(arrival) for arrival in ARRIVALS}
@@ -245,7 +248,18 @@ def measure_paths(
         rclpy.shutdown()
     received = {node: _received(folder / f"{node}.npy", end.messages) for node, end in ends.items()}
     lost = {node: int(np.sum(times == 0)) for node, times in received.items()}
-    return Paths(log.summarise(received), reference.error, reference.held, lost, realtime)
+    return Paths(log.summarise(received), reference.error, reference.held, lost, settings)
+
+
+def _listen_at(priority: int) -> None:
+    """Have the middleware's threads here preempt what the nodes do after a command is out.
+
+    A command is timed when it is received, and the loop's thread goes on with the next frame's part on the core that
+    would wake them. This thread, which is awake all the time, stays where it is, or they would wait for it.
+    """
+    realtime.fifo_priority(priority)
+    if priority > 0:
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
 
 
 def _ros(namespace: str, parameters: list[str]) -> list[str]:
