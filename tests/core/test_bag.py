@@ -1,5 +1,6 @@
 """Bags, held against two readers that are not ours: rosbags and mcap with its ROS 2 decoder."""
 
+import gc
 import random
 import resource
 from pathlib import Path
@@ -406,6 +407,17 @@ def test_finished_files_may_be_deleted_meanwhile(tmp_path, small_chunks):
                 assert writer.bytes_written == written
     assert writer.removed_files > 2
     assert frames_of(path)[-1] == 599
+
+
+def test_a_recording_without_an_end_keeps_no_index_of_finished_files(tmp_path, small_chunks):
+    with BagWriter(tmp_path / "night", {}, split_bytes=5000) as writer:
+        for frame in range(200):
+            writer.write(SLOPES, wire.SLOPES.type, slope_frame(frame), START + frame, START + frame)
+            writer.flush()
+        gc.collect()
+        indices = sum(isinstance(one, Writer) for one in gc.get_objects())
+    assert len(list((tmp_path / "night").glob("*.mcap"))) > 10
+    assert indices == 1
 
 
 def test_later_files_repeat_no_more_than_asked_for(tmp_path, small_chunks):
