@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import shutil
 import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -196,22 +197,27 @@ def _soak(options: argparse.Namespace) -> int:
     from domain_coordinator import domain_id
 
     system = system_of(options)
-    with (
-        domain_id() as domain,
-        tempfile.TemporaryDirectory(prefix="srtomo-soak-", dir=options.folder) as folder,
-        Progress("soak") as progress,
-    ):
-        os.environ["ROS_DOMAIN_ID"] = str(domain)
-        found = soak.soak(
-            system,
-            options.system,
-            changes_of(options),
-            options.frames,
-            Path(folder),
-            options.swap_every,
-            options.split,
-            progress=progress.share,
-        )
+    folder = Path(tempfile.mkdtemp(prefix="srtomo-soak-", dir=options.folder))
+    kept = False
+    try:
+        with domain_id() as domain, Progress("soak") as progress:
+            os.environ["ROS_DOMAIN_ID"] = str(domain)
+            found = soak.soak(
+                system,
+                options.system,
+                changes_of(options),
+                options.frames,
+                folder,
+                options.swap_every,
+                options.split,
+                progress=progress.share,
+            )
+    except ValueError as error:
+        kept = True
+        raise ValueError(f"{error}; logs and what was not checked yet are in {folder}") from None
+    finally:
+        if not kept:
+            shutil.rmtree(folder, ignore_errors=True)
     print("\n".join(soak.lines(found, system)))
     write_json(options.json, {"system": system.name, **soak.numbers(found)})
     return 0 if found.flat else 1

@@ -16,7 +16,7 @@ from srtomo_core.bag import BagMessage, BagWriter
 from srtomo_core.layout import Layout
 from srtomo_core.system import load_system
 from srtomo_core.wire import DmCommandWriter, read_dm_command
-from srtomo_ops.bench.soak import LEAK, Memory
+from srtomo_ops.bench.soak import LEAK, Memory, in_force
 from srtomo_ops.bench.soak_check import Check, SoakError
 from srtomo_ops.bench.soak_plan import Fault, Matrices, Plan, Sensors
 from srtomo_ops.simulate import plain_settings
@@ -209,6 +209,11 @@ def test_the_whole_of_it(start_process: Any, tmp_path: Path) -> None:
     assert found["refused"] >= 1
     assert "every frame has one command" in process.output
     assert not list(tmp_path.glob("srtomo-soak-*"))
+
+
+def test_of_two_swaps_between_two_frames_the_later_one_counts() -> None:
+    told = [(0, 1), (60, 2), (120, 1), (120, 3), (180, 2), (180, 3), (240, 1), (300, 2)]
+    assert in_force(told, 300) == [(0, 1), (60, 2), (120, 3), (240, 1)]
 
 
 @pytest.mark.slow
