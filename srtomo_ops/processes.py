@@ -9,6 +9,7 @@ import sys
 import time
 from pathlib import Path
 from types import TracebackType
+from typing import Any
 
 
 class NodeError(ValueError):
@@ -18,6 +19,8 @@ class NodeError(ValueError):
 class Processes:
     """``with Processes(folder) as nodes: nodes.start("hrtc", [...])``; leaving ends whatever still runs.
 
+    SIGINT and SIGTERM leave it too, as a KeyboardInterrupt. To be entered by the main thread.
+
     Args:
         folder: where each node's output goes, as NAME.log.
     """
@@ -25,6 +28,7 @@ class Processes:
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         self._running: dict[str, subprocess.Popen[bytes]] = {}
+        self._handlers: dict[signal.Signals, Any] = {}
 
     def start(self, name: str, words: list[str], module: str = "srtomo_ops.cli") -> None:
         """Start ``srtomo WORDS...`` under a name, or another module with these words."""
@@ -85,6 +89,9 @@ class Processes:
             return process.wait()
 
     def __enter__(self) -> Processes:
+        # whoever ends this process politely, and a shell that has it ignore Ctrl-C in the background, end the nodes too
+        for number in (signal.SIGINT, signal.SIGTERM):
+            self._handlers[number] = signal.signal(number, signal.default_int_handler)
         return self
 
     def __exit__(
@@ -96,3 +103,6 @@ class Processes:
         end = time.monotonic() + 10
         for name in list(self._running):
             self.stop(name, max(0.1, end - time.monotonic()))
+        for number, handler in self._handlers.items():
+            if handler is not None:  # one that is not Python's cannot be put back
+                signal.signal(number, handler)
