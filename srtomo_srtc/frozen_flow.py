@@ -38,6 +38,8 @@ def independent_frames(
 ) -> Array:
     """Number of independent frames with the variance of ``n_frames`` in sequence, (n_influences,).
 
+    An influence of nothing, as the share of a group that holds all turbulence has, is known without any: ``n_frames``.
+
     Args:
         model: of the turbulence; a coarse one will do.
         inverse: (n, n) C^-1 of the slopes with their noise.
@@ -65,10 +67,16 @@ def independent_frames(
         return np.array([np.vdot(C.T @ a, b) for a, b in zip(first, through(C.T @ Z))], np.float64)
 
     alone = correlated(np.asarray(np.linalg.inv(inverse), np.float32))
-    times, correlations = [0.0], [correlated(model.lagged(strengths, outer_scale, velocity, 0.0)) / alone]
+
+    def relative(time: float) -> Array:
+        """Of turbulence with that a ``time`` (s) ago."""
+        there = correlated(model.lagged(strengths, outer_scale, velocity, time))
+        return np.divide(there, alone, out=np.zeros_like(alone), where=alone > 0)
+
+    times, correlations = [0.0], [relative(0.0)]
     while times[-1] < end and correlations[-1].max() > _NEGLIGIBLE:
         times.append(_RATIO * times[-1] or _FIRST * size / speed)
-        correlations.append(correlated(model.lagged(strengths, outer_scale, velocity, times[-1])) / alone)
+        correlations.append(relative(times[-1]))
     times.append(_RATIO * times[-1])
     correlations.append(np.zeros(len(influences)))
     k = np.arange(1, n_frames)

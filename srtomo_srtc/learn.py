@@ -294,7 +294,8 @@ def learn(
     Raises:
         LearnError: there are too few frames, or none that are finite; the fit does not converge, or ends where no sky
             is. Nothing is learned then.
-        ValueError: the statistics or the layout are another instrument's; the altitudes are not ascending.
+        ValueError: the statistics or the layout are another instrument's; the altitudes are not ascending; ``limit`` is
+            too small.
     """
     layout = layout_of(system, layout)
     grid = default_altitudes(system, layout) if altitudes is None else np.asarray(altitudes, np.float64)
@@ -322,10 +323,10 @@ def _start(
     start = strengths_at(system, model.heights / system.airmass), system.atmosphere.outer_scale
     few = min(_FEW, limit // 2)
     if len(model) > 2 * few:
-        rough = SkyModel(system, layout, Sampling.of(system, layout, few, 4), model.heights)
         try:
+            rough = SkyModel(system, layout, Sampling.of(system, layout, few, 4), model.heights)
             found = fit(rough, rough.measured(statistics.covariance, statistics.mean), *start)
-        except LearnError:
+        except ValueError:  # no sky fits, or they are too few
             pass
         else:
             return found.strengths, found.outer_scale, found.levels

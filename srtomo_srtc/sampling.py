@@ -29,6 +29,9 @@ CELLS = 8
 """Node cells across a sub-aperture, and across a block. With two, the paper's, 4 % of the slopes' variance is missing
 from the model, up to 15 % in the middle eigen-bands; what coarse blocks lack is taken for noise."""
 
+FEWEST = 40
+"""Slopes of a sensor that there is always a sampling with."""
+
 _IN_BLOCKS = 0.6  # of the slopes, at most
 _CENTRE = 0.55  # of the pupil's radius: of the part with single sub-apertures
 
@@ -71,7 +74,8 @@ class Sampling:
         The tip-tilt of a one-lens sensor has the telescope's shake in it, and its noise is lost under the atmosphere's.
 
         Raises:
-            ValueError: there is no sensor with more than one sub-aperture.
+            ValueError: there is no sensor with more than one sub-aperture, or ``limit`` is too small for some blocks of
+                each; :data:`FEWEST` a sensor are enough.
         """
         many = [w for w, place in enumerate(layout.sensors) if place.n_valid > 1]
         if not many:
@@ -129,9 +133,12 @@ def _parts(
         return [(Part(sensor, place, cells), sparse.csr_array(sparse.eye_array(place.n_valid)))]
     across = 2
     # blocks lie about the centre of the pupil, as their sensor's grid does
-    while len(place.mask) % across % 2 or len(_blocks(place, across)) > _IN_BLOCKS * limit:
+    while len(place.mask) % across % 2 or len(_blocks(place, across)) > max(0.0, _IN_BLOCKS * limit):
         across += 1
     blocks = _blocks(place, across)
+    if not blocks:
+        least = FEWEST * sum(other.subapertures > 1 for other in system.sensors)
+        raise ValueError(f"{system.name}: too few slopes to work with: expected at least {least}")
     centres = np.array([place.local[block].mean(axis=0) for block in blocks])
     aim = _CENTRE * system.telescope.diameter / 2
     nearest = np.argsort(np.hypot(centres[:, 0] - aim, centres[:, 1]), kind="stable")

@@ -15,9 +15,11 @@ from srtomo_core.bag import BagError, BagReader
 from srtomo_core.layout import Layout
 from srtomo_core.reconstructor import load_interaction_matrix
 from srtomo_core.system import System
-from srtomo_ops.options import writable_file, write_json
+from srtomo_ops.options import add_registration, writable_file, write_json
 from srtomo_srtc.learn import LIMIT, Learned, learn
 from srtomo_srtc.mirrors import interaction_matrix
+from srtomo_srtc.registration import registered_layout
+from srtomo_srtc.sampling import FEWEST, Sampling
 from srtomo_srtc.telemetry import Statistics, Telemetry
 
 EXAMPLE = """examples:
@@ -40,8 +42,13 @@ def configure(parser: argparse.ArgumentParser) -> None:
         type=Path,
         help="the one that the loop ran with, made by 'srtomo calibrate' (default: computed)",
     )
+    add_registration(parser)
     parser.add_argument(
-        "--slopes", metavar="N", type=int, default=LIMIT, help=f"to work with, at most about (default: {LIMIT})"
+        "--slopes",
+        metavar="N",
+        type=int,
+        default=LIMIT,
+        help=f"to work with, at most about (default: {LIMIT}; {FEWEST} a sensor are always enough)",
     )
     parser.add_argument("-o", "--output", metavar="FILE", type=Path, help="write what was learned to FILE as JSON")
     parser.add_argument("--plot", metavar="FILE", type=Path, help="draw profile and covariances to FILE")
@@ -63,9 +70,11 @@ def main(options: argparse.Namespace) -> int:
         if text is None:
             raise BagError(f"{options.bag}: does not say which instrument it is of: not recorded by 'srtomo record'?")
         system = System.model_validate_json(text)
-        statistics = _statistics(reader, system, options.interaction_matrix)
+        layout, _ = registered_layout(options.registration, system)
+        Sampling.of(system, layout, options.slopes)  # before any work
+        statistics = _statistics(reader, system, layout, options.interaction_matrix)
     start = time.perf_counter()
-    learned = learn(system, statistics, altitudes=options.altitudes, limit=options.slopes)
+    learned = learn(system, statistics, layout=layout, altitudes=options.altitudes, limit=options.slopes)
     seconds = time.perf_counter() - start
     _print(system, statistics, learned)
     if options.plot is not None:
@@ -76,14 +85,13 @@ def main(options: argparse.Namespace) -> int:
     return 0
 
 
-def _statistics(reader: BagReader, system: System, matrix: Path | None) -> Statistics:
-    layout = Layout(system)
+def _statistics(reader: BagReader, system: System, layout: Layout, matrix: Path | None) -> Statistics:
     G: NDArray[np.floating] = (
         interaction_matrix(system, layout) if matrix is None else load_interaction_matrix(matrix, layout.fingerprint)
     )
     first, last = reader.time_range
     # one block, longer than the bag: nothing is forgotten or held out
-    telemetry = Telemetry(system, G, window=(last - first) * 1e-9 + 1, blocks=1, held_out=0)
+    telemetry = Telemetry(system, G, layout=layout, window=(last - first) * 1e-9 + 1, blocks=1, held_out=0)
     telemetry.feed(reader)
     return telemetry.statistics()
 

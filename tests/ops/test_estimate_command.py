@@ -31,6 +31,9 @@ def test_a_bag_s_sky(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
         (["no_such_bag"], "no_such_bag"),
         ([str(BAG), "--altitudes", "0,9000,3000"], "altitudes: expected ascending"),
         ([str(BAG), "--altitudes", "low"], "--altitudes"),
+        ([str(BAG), "--slopes", "3"], "too few slopes to work with: expected at least 120"),
+        ([str(BAG), "--slopes", "-1"], "too few slopes to work with: expected at least 120"),
+        ([str(BAG), "--registration", "no_such_file.json"], "no_such_file.json"),
         ([str(BAG), "-o", "/no/such/folder/sky.json"], "no such folder"),
     ],
 )

@@ -181,6 +181,14 @@ def test_what_is_made_at_the_registered_places(
             assert np.linalg.norm(content["G"] - true_response) < share * far, path
     load_interaction_matrix(calibrated, layout.fingerprint)
     assert _moved(mini, Layout(mini), MOVES).fingerprint == layout.fingerprint
+    # of a loop whose sensors were not moved, what a wrong place does not explain is taken for noise
+    bag, noise = Path(__file__).parents[2] / "bags" / "mini", []
+    for believed in ([], ["--registration", places]):
+        words = ["estimate", str(bag), "--altitudes", "0,3000,10000", *believed, "-o", str(tmp_path / "sky.json")]
+        assert main(words) == 0
+        levels = json.loads((tmp_path / "sky.json").read_text())["noise"]
+        noise.append([level["variance_factor"] for level in levels])
+    assert np.all(np.subtract(*noise[::-1]) > 0.01)
     capsys.readouterr()
     assert main(["reconstruct", "gnao_ltao", "--registration", places, *method]) == 2
     assert "of another instrument (fingerprint" in capsys.readouterr().err

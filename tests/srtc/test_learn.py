@@ -410,6 +410,10 @@ def test_how_many_independent_frames_there_are(system: System) -> None:
     assert 1 <= still < 1.5
     assert 1 < slow < 0.6 * fast < 200
     assert frames(1, 0.01)[1] > 3 * fast  # noise is new in every frame, and tells of itself
+    # what no frame tells of, such as the share of a group that has it all, leaves the others' alone
+    expected = frames(1, 0.01)
+    influences.insert(0, np.zeros_like(C))
+    assert frames(1, 0.01) == pytest.approx([400, *expected])
 
 
 # --- fewer slopes ---------------------------------------------------------------------------------------------------
