@@ -38,6 +38,19 @@ def transmission(telescope: Telescope, x: Array, y: Array) -> Array:
     return inside.astype(np.float64)
 
 
+def is_lit_around(telescope: Telescope, x: Array, y: Array, reach: float) -> NDArray[np.bool_]:
+    """Whether all of the pupil is open within ``reach`` (m) of points; now and then not where it only just is."""
+    radius = telescope.diameter / 2
+    cx, cy = telescope.obscuration_centre
+    open_around = np.hypot(x, y) + reach < radius
+    if telescope.obscuration > 0:
+        open_around &= np.hypot(x - cx, y - cy) - reach > radius * telescope.obscuration
+    for spider in telescope.spiders:
+        c, s = np.cos(spider.angle), np.sin(spider.angle)
+        open_around &= (c * x + s * y < -reach) | (np.abs(c * y - s * x) - reach > spider.width / 2)
+    return np.asarray(open_around)
+
+
 def _within(x: Array, y: Array, radius: float) -> NDArray[np.bool_]:
     """``hypot(x, y) <= radius``, where only points at the edge need the function's care."""
     square = x * x + y * y

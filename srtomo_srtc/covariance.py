@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from itertools import pairwise
 
@@ -22,7 +22,8 @@ from scipy import sparse
 
 from srtomo_srtc.atmosphere import CovarianceTable, Profile
 from srtomo_srtc.geometry import Footprints, Lattice, SeenLattice
-from srtomo_srtc.lattice import Correlator, PairTable, is_on_lattice
+from srtomo_srtc.gradient import Stencils
+from srtomo_srtc.lattice import Baselines, Correlator, PairTable
 from srtomo_srtc.layered import WIDEST, LayeredCorrelator, Neighbours
 from srtomo_srtc.parallel import Progress, run, silent
 from srtomo_srtc.solve import SymmetricTiles
@@ -43,15 +44,17 @@ class Sightline:
         nodes: on the profile's layers.
         gradient: (n_slopes, n_nodes) 1/m.
         seen: the same nodes as a lattice; without it, everything goes layer by layer.
+        stencils: the gradient on that lattice; wanted with it.
     """
 
     nodes: Footprints
     gradient: sparse.csr_array
     seen: SeenLattice | None = None
+    stencils: Stencils | None = None
 
     def only(self, layers: slice) -> Sightline:
         """The same on some of the layers."""
-        return Sightline(self.nodes.only(layers), self.gradient, self.seen and self.seen.only(layers))
+        return replace(self, nodes=self.nodes.only(layers), seen=self.seen and self.seen.only(layers))
 
 
 def _span(values: Sequence[Array]) -> Array:
@@ -117,13 +120,12 @@ def slope_tiles(
     starts = [0, *np.cumsum([sensor.gradient.shape[0] for sensor in sensors]).tolist()]
     out = SymmetricTiles(starts[-1], np.float32 if fast else np.float64)
     tasks: list[Callable[[], None]] = []
+    widest = max(sensor.gradient.shape[0] for sensor in sensors)
     for i, first in enumerate(sensors):
+        strips = _strips(first.gradient, 4 * widest)
         for j, second in enumerate(sensors[: i + 1]):
             correlate = _node_correlation(turbulence, first, second, fast)
-            tasks += [
-                partial(_write_slopes, out, correlate, first.gradient, subapertures, starts[i], starts[j])
-                for subapertures in _stretches(first.gradient.shape[0] // 2, 4 * second.gradient.shape[0])
-            ]
+            tasks += [partial(_write_slopes, out, correlate, strip, starts[i], starts[j]) for strip in strips]
     run(tasks, threads, progress)
     return out
 
@@ -262,21 +264,19 @@ Correlate = Callable[[slice], Matrix]
 """Covariance of a stretch of points with all slopes of one sensor: (n_points, n_slopes) rad m."""
 
 
-@lru_cache(maxsize=128)
-def _centres(points: Lattice, lattice: Lattice) -> Array:
-    return lattice.to_steps(*points.points())
+@lru_cache(maxsize=512)
+def _baselines(points: Lattice, lattice: Lattice) -> Baselines:
+    return Baselines.between(lattice.to_steps(*points.points()), lattice)
 
 
 def _node_correlation(turbulence: Turbulence, first: Sightline, second: Sightline, fast: bool) -> Correlate:
     """Of the first sensor's nodes with the second sensor's slopes."""
     a, b = first.seen, second.seen
-    if a is not None and b is not None and np.array_equal(a.cones, b.cones):
-        centres = _centres(a.lattice, b.lattice)
-        if fast or is_on_lattice(centres):
-            table = PairTable.build(
-                b.lattice, centres, b.cones, b.offsets - a.offsets, turbulence.fractions, turbulence.table
-            )
-            return Correlator(table, second.gradient)
+    if a is not None and b is not None and second.stencils is not None and np.array_equal(a.cones, b.cones):
+        baselines = _baselines(a.lattice, b.lattice)
+        if fast or baselines.divisions == 1:
+            table = PairTable.build(baselines, b.cones, b.offsets - a.offsets, turbulence.fractions, turbulence.table)
+            return Correlator(table, second.stencils)
     return _layer_by_layer(turbulence, second, first.nodes)
 
 
@@ -297,22 +297,36 @@ def _layer_by_layer(turbulence: Turbulence, sensor: Sightline, points: Footprint
     return correlate
 
 
-def _write_slopes(
-    out: SymmetricTiles,
-    correlate: Correlate,
-    gradient: sparse.csr_array,
-    subapertures: slice,
-    row: int,
-    column: int,
-) -> None:
-    """The slopes of some of a sensor's sub-apertures with all of another's, which begin at ``row`` and ``column``."""
+@dataclass(frozen=True)
+class _Strip:
+    """Neighbouring slopes of a sensor's sub-apertures.
+
+    Attributes:
+        nodes: that they are made from.
+        parts: of x and of y slopes: the first, and the gradient on these nodes.
+    """
+
+    nodes: slice
+    parts: list[tuple[int, sparse.csr_array]]
+
+
+def _strips(gradient: sparse.csr_array, width: int) -> list[_Strip]:
+    """All of a sensor's slopes, as :func:`_stretches` of sub-apertures."""
     n_valid = gradient.shape[0] // 2
-    both = [gradient[subapertures], gradient[n_valid + subapertures.start : n_valid + subapertures.stop]]
-    used = np.concatenate([part.indices for part in both])
-    nodes = slice(int(used.min()), int(used.max()) + 1)
-    correlated = correlate(nodes)
-    for axis, part in enumerate(both):
-        out.write(row + axis * n_valid + subapertures.start, column, part[:, nodes] @ correlated)
+    strips = []
+    for some in _stretches(n_valid, width):
+        both = [gradient[some.start + first : some.stop + first] for first in (0, n_valid)]
+        used = np.concatenate([part.indices for part in both])
+        nodes = slice(int(used.min()), int(used.max()) + 1)
+        strips.append(_Strip(nodes, [(some.start, both[0][:, nodes]), (some.start + n_valid, both[1][:, nodes])]))
+    return strips
+
+
+def _write_slopes(out: SymmetricTiles, correlate: Correlate, strip: _Strip, row: int, column: int) -> None:
+    """Some of a sensor's slopes with all of another's; the sensors' begin at ``row`` and ``column``."""
+    correlated = correlate(strip.nodes)
+    for first, gradient in strip.parts:
+        out.write(row + first, column, gradient @ correlated)
 
 
 def _stretches(n: int, width: int) -> Iterator[slice]:

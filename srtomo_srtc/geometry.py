@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
-from srtomo_core.layout import SensorLayout, transmission
+from srtomo_core.layout import SensorLayout, is_lit_around, transmission
 from srtomo_core.system import Direction, Telescope
 
 Array = NDArray[np.float64]
@@ -85,19 +85,22 @@ class Lattice:
 
     @lru_cache(maxsize=64)  # noqa: B019 - few and small
     def rows(self, multiple: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """The rows of the lattice that have nodes, in pieces of a multiple of so many columns.
+        """Nodes that follow each other in a row of the lattice, in pieces of a multiple of so many columns.
+
+        A gap is bridged when it is no longer than that.
 
         Returns:
-            (n_rows, 3) each row, its first column and the number of columns.
-            (n_nodes,) where each node is when these rows follow each other.
+            (n_pieces, 3) row, first column and number of columns of each.
+            (n_nodes,) where each node is when these pieces follow each other.
         """
-        rows, begins = np.unique(self.row, return_index=True)
+        new = np.ones(len(self.row), bool)
+        new[1:] = (np.diff(self.row) != 0) | (np.diff(self.column) > multiple)
+        begins = np.flatnonzero(new)
         first = self.column[begins]
-        length = self.column[np.append(begins[1:], len(self.row)) - 1] - first + 1
+        length = self.column[np.append(begins, len(new))[1:] - 1] - first + 1
         length = -(-length // multiple) * multiple
-        which = np.searchsorted(rows, self.row)
-        place = (np.cumsum(length) - length - first)[which] + self.column
-        return np.stack([rows, first, length], axis=1), place
+        place = (np.cumsum(length) - length - first)[np.cumsum(new) - 1] + self.column
+        return np.stack([self.row[begins], first, length], axis=1), place
 
 
 @dataclass(frozen=True)
@@ -174,10 +177,15 @@ def cell_light(telescope: Telescope, sensor: SensorLayout, cells: int, fine: int
 
         Each (n_valid, cells, cells), indexed [sub-aperture, y, x] in the sensor's own axes.
     """
-    points = transmission(telescope, *sensor.points(cells * fine)).reshape(sensor.n_valid, cells, fine, cells, fine)
+    light, u, v = (np.full((sensor.n_valid, cells, cells), full) for full in (1.0, 0.5, 0.5))
+    # most sub-apertures are far from every edge
+    centres = sensor.to_pupil(*sensor.local.T)
+    cut = np.flatnonzero(~is_lit_around(telescope, *centres, sensor.size * math.sqrt(0.5)))
+    edge = replace(sensor, local=sensor.local[cut], illumination=sensor.illumination[cut])
+    points = transmission(telescope, *edge.points(cells * fine)).reshape(len(cut), cells, fine, cells, fine)
     place = (np.arange(fine) + 0.5) / fine
-    light = points.mean(axis=(2, 4))
-    lit = np.where(light > 0, light, 1)
-    u = (points * place).mean(axis=(2, 4)) / lit
-    v = (points * place[:, None, None]).mean(axis=(2, 4)) / lit
+    light[cut] = points.mean(axis=(2, 4))
+    lit = np.where(light[cut] > 0, light[cut], 1)
+    u[cut] = (points * place).mean(axis=(2, 4)) / lit
+    v[cut] = (points * place[:, None, None]).mean(axis=(2, 4)) / lit
     return light, u, v

@@ -14,7 +14,8 @@ a dark one. Whatever the light, a unit x-ramp gives exactly 1 in x and 0 in y, a
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +34,76 @@ OVERSAMPLING = 2
 """Default number of node cells across a sub-aperture, or across such a part of one."""
 
 _FINE = 16  # points across a node cell when its light is averaged
+_ALIKE = 1e-12  # of the largest weight: less apart is rounding
+_FEW_ALIKE = 8  # slopes: what is found for all at once pays for more
+
+
+@dataclass(frozen=True, eq=False)
+class Stencil:
+    """What fully lit sub-apertures have in common: the same weights, each somewhere else on the lattice.
+
+    Attributes:
+        row, column: (n_weights,) from where the stencil lies, not negative.
+        weights: (n_weights,) 1/m.
+        slopes: (n_alike,) which slopes have it.
+        place: (n_alike, 2) row and column of the lattice where it lies for each.
+    """
+
+    row: NDArray[np.int64]
+    column: NDArray[np.int64]
+    weights: Array
+    slopes: NDArray[np.int64]
+    place: NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class Stencils:
+    """A gradient operator taken apart: slopes that share a stencil, and those with one of their own.
+
+    Attributes:
+        n_slopes: in all.
+        shared: at most one stencil for x and one for y.
+        others: (n_others,) slopes that have none of these.
+        matrix: (n_others, n_nodes) 1/m, the operator's rows of ``others``, on the nodes of ``lattice``.
+        lattice: the nodes that these need.
+    """
+
+    n_slopes: int
+    shared: tuple[Stencil, ...]
+    others: NDArray[np.int64]
+    matrix: sparse.csr_array
+    lattice: Lattice
+
+    @classmethod
+    def of(cls, matrix: sparse.csr_array, lattice: Lattice) -> Stencils:
+        """Take the operator of all slopes (n_slopes, n_nodes), all x then all y, apart."""
+        n = matrix.shape[0]
+        found = (_most_common(matrix, lattice, rows) for rows in np.split(np.arange(n), 2))
+        shared = tuple(stencil for stencil in found if len(stencil.slopes) > _FEW_ALIKE)
+        others = np.setdiff1d(np.arange(n), np.concatenate([np.zeros(0, int), *(s.slopes for s in shared)]))
+        rest = matrix[others]
+        used = np.unique(rest.indices)
+        nodes = replace(lattice, row=lattice.row[used], column=lattice.column[used])
+        return cls(n, shared, others, rest[:, used], nodes)
+
+
+def _most_common(matrix: sparse.csr_array, lattice: Lattice, slopes: NDArray[np.int64]) -> Stencil:
+    """The stencil that most of these slopes have."""
+    length = np.diff(matrix.indptr)[slopes]
+    usual = np.bincount(length).argmax()
+    slopes = slopes[length == usual]
+    entries = matrix.indptr[slopes][:, None] + np.arange(usual)
+    nodes, weights = matrix.indices[entries], matrix.data[entries]
+    row, column = lattice.row[nodes], lattice.column[nodes]
+    place = np.stack([row.min(axis=1), column.min(axis=1)], axis=1)
+    row, column = row - place[:, :1], column - place[:, 1:]
+    least = _ALIKE * np.abs(weights).max()
+    looks = np.hstack([row, column, np.rint(weights / (1e3 * least)).astype(np.int64)])
+    _, first, count = np.unique(looks, axis=0, return_index=True, return_counts=True)
+    typical = first[count.argmax()]
+    same = (row == row[typical]).all(axis=1) & (column == column[typical]).all(axis=1)
+    same &= (np.abs(weights - weights[typical]) < least).all(axis=1)
+    return Stencil(row[typical], column[typical], weights[typical], slopes[same], place[same])
 
 
 @dataclass(frozen=True)
@@ -50,6 +121,11 @@ class GradientOperator:
     y: Array
     matrix: sparse.csr_array
     lattice: Lattice
+
+    @cached_property
+    def stencils(self) -> Stencils:
+        """The same, with what most slopes have in common known once."""
+        return Stencils.of(self.matrix, self.lattice)
 
 
 def gradient_operator(

@@ -18,10 +18,10 @@ from dataclasses import dataclass
 import numba
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
 
 from srtomo_srtc.atmosphere import CovarianceTable
 from srtomo_srtc.geometry import Lattice
+from srtomo_srtc.gradient import Stencils
 
 Array = NDArray[np.float64]
 Matrix = NDArray[np.floating]
@@ -29,37 +29,58 @@ Indices = NDArray[np.integer]
 
 _DIVISIONS = 4  # of the lattice's step, where a table is interpolated
 _COLUMNS = 8  # of which a row's length is a multiple: loops that leave no rest are quicker
-_POINTS = 48  # whose nodes are held at a time: as much as a cache holds
+_POINTS = 48  # whose nodes are held at a time, or more while these are few: as much as a cache holds
+_HELD = 2**16  # nodes of all these points
 _ON_LATTICE = 1e-7  # steps of the lattice: closer is on it
 
 
-@dataclass(frozen=True)
-class PairTable:
-    """Covariance summed over the layers, on a grid of baselines in steps of a sensor's lattice along its own axes.
+@dataclass(frozen=True, eq=False)
+class Baselines:
+    """A grid of baselines from points to a sensor's nodes, in steps of the sensor's lattice along its own axes.
 
     Attributes:
         lattice: the sensor's.
         centres: (n_points, 2) row and column, not whole, of the points in the lattice.
+        divisions: of the step. Without, all baselines are on the grid.
         first: baseline (y, x) of the grid's first point.
-        values: (divisions, divisions, n_rows, n_columns) m^2; ``values[a, b, r, c]`` belongs to the baseline
-            ``first + (r, c) + (a, b) / divisions``. Without divisions the points are on the grid.
+        shape: number of whole steps down and across.
     """
 
     lattice: Lattice
     centres: Array
+    divisions: int
     first: Array
+    shape: tuple[int, int]
+
+    @classmethod
+    def between(cls, centres: Array, lattice: Lattice) -> Baselines:
+        """As many as all pairs of points and nodes need."""
+        divisions, margin = (1, 1) if is_on_lattice(centres) else (_DIVISIONS, 3)
+        nodes = np.stack([lattice.row, lattice.column], axis=1)
+        first = np.floor(nodes.min(axis=0) - centres.max(axis=0)) - margin
+        last = np.ceil(nodes.max(axis=0) - centres.min(axis=0)) + margin
+        n_rows, n_columns = (last - first).astype(int) + 1
+        if divisions == 1:
+            first += -centres[0] % 1
+        return cls(lattice, centres, divisions, first, (int(n_rows), int(n_columns)))
+
+
+@dataclass(frozen=True)
+class PairTable:
+    """Covariance summed over the layers.
+
+    Attributes:
+        baselines: from the points to the sensor's nodes.
+        values: (divisions, divisions, n_rows, n_columns) m^2; ``values[a, b, r, c]`` belongs to the baseline
+            ``first + (r, c) + (a, b) / divisions``.
+    """
+
+    baselines: Baselines
     values: Array
 
     @classmethod
     def build(
-        cls,
-        lattice: Lattice,
-        centres: Array,
-        cones: Array,
-        offsets: Array,
-        fractions: Array,
-        table: CovarianceTable,
-        dtype: type[np.floating] = np.float64,
+        cls, baselines: Baselines, cones: Array, offsets: Array, fractions: Array, table: CovarianceTable
     ) -> PairTable:
         """Tabulate.
 
@@ -68,46 +89,64 @@ class PairTable:
             offsets: (n_layers, 2) x and y by which the sensor's footprint is displaced from that of the points, m.
             fractions: (n_layers,) of the layers.
             table: of the covariance.
-            dtype: of the values.
         """
-        divisions, margin = (1, 1) if is_on_lattice(centres) else (_DIVISIONS, 3)
-        nodes = np.stack([lattice.row, lattice.column], axis=1)
-        first = np.floor(nodes.min(axis=0) - centres.max(axis=0)) - margin
-        last = np.ceil(nodes.max(axis=0) - centres.min(axis=0)) + margin
-        n_rows, n_columns = (last - first).astype(int) + 1
-        if divisions == 1:
-            first += -centres[0] % 1
-        values = np.zeros((divisions, divisions, n_rows, n_columns + _COLUMNS), dtype)
-        tabulate(cones, offsets, fractions, lattice.step, lattice.rotation, table.values, 1 / table.step, first, values)
-        return cls(lattice, centres, first, values)
+        lattice, divisions, (n_rows, n_columns) = baselines.lattice, baselines.divisions, baselines.shape
+        values = np.zeros((divisions, divisions, n_rows, n_columns + _COLUMNS))
+        tabulate(
+            cones,
+            offsets,
+            fractions,
+            lattice.step,
+            lattice.rotation,
+            table.values,
+            1 / table.step,
+            baselines.first,
+            values,
+        )
+        return cls(baselines, values)
 
 
 class Correlator:
-    """Covariance of the wavefront at points with a sensor's slopes."""
+    """Covariance of the wavefront at points with a sensor's slopes.
 
-    def __init__(self, table: PairTable, gradient: sparse.csr_array) -> None:
+    Most slopes share a stencil (:class:`Stencils`). Put on the table, it makes one of the wavefront with such a slope,
+    as a function of where the sub-aperture is: a look-up for each, and none for its nodes.
+    """
+
+    def __init__(self, table: PairTable, stencils: Stencils) -> None:
         """Set up.
 
         Args:
             table: of the points and the sensor's nodes.
-            gradient: (n_slopes, n_nodes) of the sensor, 1/m.
+            stencils: of the sensor.
         """
-        self._place = (-table.centres - table.first) * len(table.values)
+        self._place = (-table.baselines.centres - table.baselines.first) * len(table.values)
         self._table = table.values
-        self._rows, where = table.lattice.rows(_COLUMNS)
-        self._gradient = gradient.indptr, where[gradient.indices], gradient.data.astype(table.values.dtype)
+        n_columns = table.values.shape[3]
+        self._shared = []
+        for s in stencils.shared:
+            values = np.zeros_like(table.values)
+            _put_stencil(table.values, s.row, s.column, s.weights, values)
+            self._shared.append((values, s.place[:, 0] * n_columns + s.place[:, 1], s.slopes))
+        self._n_slopes, self._others = stencils.n_slopes, stencils.others
+        self._rows, where = stencils.lattice.rows(_COLUMNS)
+        self._gradient = stencils.matrix.indptr, where[stencils.matrix.indices], stencils.matrix.data
 
-    def __call__(self, points: slice) -> Matrix:
+    def __call__(self, points: slice) -> Array:
         """Of some of the points: (n_points, n_slopes) rad m."""
-        every = range(*points.indices(len(self._place)))
-        out = np.empty((len(every), len(self._gradient[0]) - 1), self._table.dtype)
-        nodes = np.empty((min(_POINTS, len(every)), self._rows[:, 2].sum()), out.dtype)
-        for start in range(0, len(every), _POINTS):
-            some = every[start : start + _POINTS]
-            own = nodes[: len(some)]
-            own[:] = 0
-            _add_nodes(self._place[some.start : some.stop], self._table, self._rows, own)
-            slopes_of_nodes(own, *self._gradient, out[start : start + _POINTS])
+        place = self._place[points]
+        out = np.empty((len(place), self._n_slopes))
+        for shared in self._shared:
+            _set_slopes(place, *shared, out)
+        if len(self._others):
+            n_nodes = self._rows[:, 2].sum()
+            at_once = max(_POINTS, _HELD // n_nodes)
+            for start in range(0, len(place), at_once):
+                some = place[start : start + at_once]
+                nodes, slopes = np.zeros((len(some), n_nodes)), np.empty((len(some), len(self._others)))
+                _add_nodes(some, self._table, self._rows, nodes)
+                slopes_of_nodes(nodes, *self._gradient, slopes)
+                out[start : start + at_once, self._others] = slopes
         return out
 
 
@@ -132,7 +171,9 @@ def tabulate(
     """Add to ``out`` the covariance, summed over layers, on a grid of baselines: see :class:`PairTable`, whose
     ``values`` it is, and :meth:`PairTable.build`; ``per_step`` is 1 over the step (m) of the covariance's ``table``."""
     divisions, _, n_rows, n_columns = out.shape
-    cosine, sine, last = np.cos(rotation) * step, np.sin(rotation) * step, len(table) - 2
+    cosine, sine, last = np.cos(rotation) * step, np.sin(rotation) * step, np.float64(len(table) - 2)
+    # unsigned: an index that can count from the end costs a test
+    index, beyond = np.empty(n_columns, np.uint32), np.empty(n_columns)
     for a in range(divisions):
         for b in range(divisions):
             for r in range(n_rows):
@@ -144,10 +185,48 @@ def tabulate(
                         dy = cones[l] * (sine * u + cosine * v) + offsets[l, 1]
                         t = np.sqrt(dx * dx + dy * dy) * per_step
                         # a corner of the grid may lie farther out than any pair of points, and is then not asked for
-                        i = np.int64(t)
-                        if i > last:
-                            i = np.int64(last)
-                        row[c] += fractions[l] * (table[i] + (t - i) * (table[i + 1] - table[i]))
+                        i = np.int32(min(t, last))
+                        index[c] = i
+                        beyond[c] = t - i
+                    # apart from the look-ups the loop above vectorises
+                    for c in range(n_columns):
+                        value = table[index[c]]
+                        row[c] += fractions[l] * (value + beyond[c] * (table[index[c] + np.uint32(1)] - value))
+
+
+@numba.njit(cache=True, nogil=True, fastmath={"contract"})
+def _put_stencil(table: Matrix, row: Indices, column: Indices, weights: Array, out: Matrix) -> None:
+    """Add to ``out`` the sum of the table's entries that a stencil weighs, wherever all of it is on the table."""
+    n_rows, n_columns = table.shape[2] - row.max(), np.uint64(table.shape[3] - column.max())
+    for a in range(table.shape[0]):
+        for b in range(table.shape[1]):
+            for r in range(n_rows):
+                to = out[a, b, r]
+                for k in range(len(row)):
+                    come, w = table[a, b, r + row[k], column[k] :], weights[k]
+                    for c in range(n_columns):
+                        to[c] += w * come[c]
+
+
+@numba.njit(cache=True, nogil=True, fastmath={"contract", "reassoc"})
+def _set_slopes(place: Array, table: Matrix, beyond: Indices, slopes: Indices, out: Matrix) -> None:
+    """Set these slopes' columns of ``out``, from a table of them; ``beyond``: from where baseline 0 is in it."""
+    starts, weights = find_taps(place, table)
+    flat, total = table.reshape(-1), np.empty(len(slopes), table.dtype)
+    for p in range(len(place)):
+        into = out[p]
+        if starts.shape[1] == 1:
+            start = starts[p, 0]
+            for s in range(len(slopes)):
+                into[slopes[s]] = flat[start + beyond[s]]
+        else:
+            total[:] = 0
+            for t in range(12):
+                start, w = starts[p, t], weights[p, t]
+                for s in range(len(slopes)):
+                    total[s] += w * flat[start + beyond[s]]
+            for s in range(len(slopes)):
+                into[slopes[s]] = total[s]
 
 
 @numba.njit(cache=True, nogil=True, fastmath={"contract", "reassoc"})

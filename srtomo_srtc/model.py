@@ -51,7 +51,8 @@ def sightlines(system: System, layout: Layout, profile: Profile, oversampling: i
         operator = gradient_operator(system.telescope, place, oversampling)
         aim = star.position, system.los_range(star), profile.heights
         nodes = footprints(operator.x, operator.y, *aim)
-        lines.append(Sightline(nodes, operator.matrix, SeenLattice.towards(operator.lattice, *aim)))
+        seen = SeenLattice.towards(operator.lattice, *aim)
+        lines.append(Sightline(nodes, operator.matrix, seen, operator.stencils))
     return lines
 
 

@@ -106,6 +106,7 @@ class Sampling:
                     footprints(operator.x, operator.y, *aim),
                     operator.matrix,
                     SeenLattice.towards(operator.lattice, *aim),
+                    operator.stencils,
                 )
             )
         return lines

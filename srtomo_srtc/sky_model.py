@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -14,10 +12,10 @@ from scipy import sparse
 from srtomo_core.layout import Layout
 from srtomo_core.system import System
 from srtomo_srtc.atmosphere import CovarianceTable, Profile
-from srtomo_srtc.covariance import Sightline, Turbulence, slope_cross_covariance, slope_tiles
+from srtomo_srtc.covariance import Turbulence, slope_cross_covariance, slope_tiles
 from srtomo_srtc.model import noise_covariance
 from srtomo_srtc.sampling import Sampling
-from srtomo_srtc.wind import carried
+from srtomo_srtc.wind import sensors_carried
 
 Array = NDArray[np.float64]
 Single = NDArray[np.float32]
@@ -86,7 +84,7 @@ class SkyModel:
         """
         # without extrapolation: correlations are asked for, and the missing part hardly shows in these
         now = [line.only(layers) for line in self._grids[0][1]]
-        then = [_moved(line, velocity, time) for line in now]
+        then = sensors_carried(now, velocity, time)
         reach = self._reach + time * float(np.hypot(*velocity.T).max())
         turbulence = Turbulence(np.asarray(strengths, np.float64), _table(outer_scale, reach))
         return self.seen(slope_cross_covariance(turbulence, now, then))
@@ -109,22 +107,21 @@ class SkyModel:
         return self.seen(reduced)
 
     def _covariance(self, strengths: Array, outer_scale: float, layers: slice) -> Single:
-        out = np.zeros((len(self), len(self)))
+        out = np.zeros((len(self), len(self)), np.float32)
+        table = _table(outer_scale, self._reach)
         for weight, lines in self._grids:
-            out += weight * self._slopes(strengths, outer_scale, [line.only(layers) for line in lines])
+            turbulence = Turbulence(weight * np.asarray(strengths, np.float64), table)
+            out += slope_tiles(turbulence, [line.only(layers) for line in lines], fast=True).dense()
         return self.seen(out)
-
-    def _slopes(self, strengths: Array, outer_scale: float, lines: Sequence[Sightline]) -> Single:
-        turbulence = Turbulence(np.asarray(strengths, np.float64), _table(outer_scale, self._reach))
-        return np.asarray(slope_tiles(turbulence, lines, fast=True).dense(), np.float32)
 
     def seen(self, matrix: NDArray[np.floating]) -> Single:
         """``P matrix P``, (n, n): without the blind modes."""
-        blind = self.sampling.blind
-        out = np.array(matrix, np.float64)
-        out -= blind @ (blind.T @ out)
-        out -= (out @ blind) @ blind.T
-        return out.astype(np.float32)
+        blind, out = self.sampling.blind, np.array(matrix, np.float32)
+        left, right = out @ blind, blind.T @ out
+        right -= (blind.T @ left) @ blind.T
+        # both sides' in one product of thin matrices
+        out -= np.hstack([left, blind]).astype(np.float32) @ np.vstack([blind.T, right]).astype(np.float32)
+        return out
 
 
 def _table(outer_scale: float, reach: float) -> CovarianceTable:
@@ -135,9 +132,3 @@ def _table(outer_scale: float, reach: float) -> CovarianceTable:
 @lru_cache(maxsize=4)
 def _table_of(outer_scale: float, reach: float) -> CovarianceTable:
     return CovarianceTable.build(1.0, outer_scale, reach)
-
-
-def _moved(line: Sightline, velocity: Array, time: float) -> Sightline:
-    """Through the turbulence that the line saw a ``time`` (s) ago, where it is now."""
-    seen = line.seen and replace(line.seen, offsets=line.seen.offsets + time * velocity)
-    return Sightline(carried(line.nodes, velocity, time), line.gradient, seen)

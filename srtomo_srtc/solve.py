@@ -89,12 +89,14 @@ class SymmetricTiles:
 
     def dense(self) -> Matrix:
         """(n, n), exactly symmetric."""
-        out = np.zeros((len(self), len(self)), self.dtype)
+        out = np.empty((len(self), len(self)), self.dtype)
         for i, row in enumerate(self.tiles):
-            for j, tile in enumerate(row):
+            for j, tile in enumerate(row[:-1]):
                 out[self._part(i), self._part(j)] = tile
-        lower = np.tril(out)
-        return np.asarray(lower + np.tril(out, -1).T)
+                out[self._part(j), self._part(i)] = tile.T
+            lower = np.tril(row[-1])
+            out[self._part(i), self._part(i)] = lower + np.tril(lower, -1).T
+        return out
 
     def trace(self) -> float:
         """Sum of the diagonal."""

@@ -35,10 +35,10 @@ def carried(points: Footprints, velocity: Array, time: float) -> Footprints:
 def sensors_carried(sensors: Sequence[Sightline], velocity: Array, time: float) -> list[Sightline]:
     """Sightlines through the turbulence that the sensors measured a ``time`` (s) ago, where it is now."""
     return [
-        Sightline(
-            carried(sensor.nodes, velocity, time),
-            sensor.gradient,
-            sensor.seen and replace(sensor.seen, offsets=sensor.seen.offsets + time * velocity),
+        replace(
+            sensor,
+            nodes=carried(sensor.nodes, velocity, time),
+            seen=sensor.seen and replace(sensor.seen, offsets=sensor.seen.offsets + time * velocity),
         )
         for sensor in sensors
     ]

@@ -7,7 +7,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from srtomo_core.layout import Layout, transmission
+from srtomo_core.layout import Layout, is_lit_around, transmission
 from srtomo_core.system import System, load_system
 
 
@@ -117,6 +117,20 @@ def test_transmission():
     x = np.array([0.0, 0.35, 1.99, 2.01, 0.35 + 0.51, 0.0])
     y = np.array([0.0, -0.2, 0.0, 0.0, -0.2, -2.0])
     assert transmission(telescope, x, y).tolist() == [0, 0, 1, 0, 1, 1]
+
+
+def test_lit_around_is_lit_at_every_point_around():
+    spiders = [{"angle": "20 deg", "width": "5 cm"}, {"angle": "200 deg", "width": "5 cm"}]
+    telescope = load_system("mini", {"telescope.spiders": spiders}).telescope
+    draw = np.random.default_rng(2)
+    x, y = draw.uniform(-2.2, 2.2, (2, 4000))
+    reach = 0.2
+    radius, angle = reach * np.sqrt(draw.uniform(0, 1, (400, 1))), draw.uniform(0, 2 * np.pi, (400, 1))
+    light = transmission(telescope, x + radius * np.cos(angle), y + radius * np.sin(angle)).min(axis=0)
+    around = is_lit_around(telescope, x, y, reach)
+    assert not around[light == 0].any()
+    # where it only just is, 400 points miss the edge, and a spider's end is not looked at closely
+    assert around.sum() > 0.9 * light.sum() > 500
 
 
 def test_a_sensor_without_light_is_refused():

@@ -5,7 +5,8 @@ import pytest
 
 from srtomo_core.layout import Layout, SensorLayout, transmission
 from srtomo_core.system import System, Telescope, load_system
-from srtomo_srtc.gradient import GradientOperator, gradient_operator
+from srtomo_srtc.geometry import Lattice, cell_light
+from srtomo_srtc.gradient import GradientOperator, Stencils, gradient_operator
 
 
 @pytest.fixture(scope="module")
@@ -119,3 +120,49 @@ def test_a_dark_subaperture_is_refused(mini: System) -> None:
     place = replace(Layout(mini).sensors[0], shift=(2.0, 0.0))
     with pytest.raises(ValueError, match=r"sensor lgs1: sub-aperture .* is dark"):
         gradient_operator(mini.telescope, place)
+
+
+def _together(stencils: Stencils, lattice: Lattice) -> np.ndarray:
+    """(n_slopes, n_nodes) of what was taken apart."""
+    number = {node: i for i, node in enumerate(zip(lattice.row.tolist(), lattice.column.tolist()))}
+    out = np.zeros((stencils.n_slopes, len(number)))
+    for stencil in stencils.shared:
+        for slope, (row, column) in zip(stencil.slopes, stencil.place):
+            nodes = zip((row + stencil.row).tolist(), (column + stencil.column).tolist())
+            out[slope, [number[node] for node in nodes]] += stencil.weights
+    nodes = zip(stencils.lattice.row.tolist(), stencils.lattice.column.tolist())
+    out[np.ix_(stencils.others, [number[node] for node in nodes])] += stencils.matrix.toarray()
+    return out
+
+
+@pytest.mark.parametrize("oversampling", [1, 2, 4])
+def test_stencils_are_the_operator(mini: System, oversampling: int) -> None:
+    for place in Layout(mini).sensors:
+        operator = gradient_operator(mini.telescope, place, oversampling)
+        together = _together(operator.stencils, operator.lattice)
+        np.testing.assert_allclose(together, operator.matrix.toarray(), rtol=0, atol=1e-11)
+        # all that are fully lit share one, and a sensor of few sub-apertures has none
+        lit = int((place.illumination == 1).sum())
+        assert sum(len(stencil.slopes) for stencil in operator.stencils.shared) >= (2 * lit if lit > 8 else 0)
+        assert len(operator.stencils.shared) == (2 if lit > 8 else 0)
+
+
+def test_sub_apertures_far_from_any_edge_need_no_look_at_the_pupil(mini: System) -> None:
+    telescope = mini.telescope.model_copy(
+        update={
+            "spiders": load_system(
+                "mini", {"telescope.spiders": [{"angle": "30 deg", "width": "5 cm"}]}
+            ).telescope.spiders
+        }
+    )
+    place, cells, fine = Layout(mini).sensors[1], 2, 6
+    points = transmission(telescope, *place.points(cells * fine)).reshape(-1, cells, fine, cells, fine)
+    lit, at = points.mean(axis=(2, 4)), (np.arange(fine) + 0.5) / fine
+    light, u, v = cell_light(telescope, place, cells, fine)
+    assert np.array_equal(light, lit) and (light == 1).sum() > 100 and 0 < (light < 1).sum()
+    some = lit > 0
+    assert u[some] == pytest.approx(((points * at).mean(axis=(2, 4)) / np.where(some, lit, 1))[some], abs=1e-14)
+    assert v[some] == pytest.approx(
+        ((points * at[:, None, None]).mean(axis=(2, 4)) / np.where(some, lit, 1))[some], abs=1e-14
+    )
+    assert not u[~some].any() and not v[~some].any()
