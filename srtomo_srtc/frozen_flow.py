@@ -13,9 +13,11 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from srtomo_srtc.likelihood import inverse_of
 from srtomo_srtc.sky_model import SkyModel
 
 Array = NDArray[np.float64]
+Single = NDArray[np.float32]
 
 _PROBES = 64  # random vectors that stand for a trace
 _FIRST = 0.2  # of the time in which the fastest layer crosses a sub-aperture: the first time that is looked at
@@ -29,8 +31,9 @@ def independent_frames(
     model: SkyModel,
     strengths: Array,
     outer_scale: float,
-    inverse: NDArray[np.floating],
-    influences: Sequence[NDArray[np.floating]],
+    covariance: Array,
+    bases: Sequence[Single] | Single,
+    influences: Array,
     velocity: Array,
     size: float,
     interval: float,
@@ -42,8 +45,9 @@ def independent_frames(
 
     Args:
         model: of the turbulence; a coarse one will do.
-        inverse: (n, n) C^-1 of the slopes with their noise.
-        influences: of each parameter, ``sum_i w_i B_i`` (n, n), of which C^-1 on both sides makes M.
+        covariance: (n, n) C of the slopes with their noise.
+        bases: (n, n) each, B_i.
+        influences: (n_influences, n_bases) w of each parameter: ``sum_i w_i B_i``, with C^-1 on both sides, is its M.
         velocity: (n_layers, 2) m/s, where each layer goes.
         size: of a sub-aperture, m.
         interval: between frames, s; infinite where frames are independent.
@@ -53,20 +57,22 @@ def independent_frames(
     speed = max(_SLOWEST, float(np.hypot(*velocity[strengths > 0].T).max(initial=0.0)))
     end = min(interval * n_frames, _FARTHEST / speed)
     draw = np.random.default_rng(0)
-    Z = draw.choice(np.array([-1, 1], np.float32), (len(inverse), _PROBES))
-    A = np.asarray(inverse, np.float32)
+    Z = draw.choice(np.array([-1, 1], np.float32), (len(covariance), _PROBES))
+    A, weights = inverse_of(covariance).astype(np.float32), influences.astype(np.float32)
 
-    def through(vectors: NDArray[np.float32]) -> list[NDArray[np.float32]]:
-        """Each parameter's M, times vectors (n, n_vectors)."""
+    def through(vectors: Single) -> Single:
+        """Each parameter's M, times vectors (n, n_vectors): (n, n_influences * n_vectors)."""
         seen = A @ vectors
-        return [np.asarray(A @ (influence @ seen), np.float32) for influence in influences]
+        parts = np.stack([basis @ seen for basis in bases])
+        return np.asarray(A @ np.tensordot(parts, weights, (0, 1)).transpose(0, 2, 1).reshape(len(A), -1))
 
     first = through(Z)
 
-    def correlated(C: NDArray[np.float32]) -> Array:
-        return np.array([np.vdot(C.T @ a, b) for a, b in zip(first, through(C.T @ Z))], np.float64)
+    def correlated(C: Single) -> Array:
+        both = (C.T @ first) * through(C.T @ Z)
+        return both.reshape(len(A), len(influences), -1).sum(axis=(0, 2), dtype=np.float64)
 
-    alone = correlated(np.asarray(np.linalg.inv(inverse), np.float32))
+    alone = correlated(covariance.astype(np.float32))
 
     def relative(time: float) -> Array:
         """Of turbulence with that a ``time`` (s) ago."""
@@ -80,6 +86,6 @@ def independent_frames(
     times.append(_RATIO * times[-1])
     correlations.append(np.zeros(len(influences)))
     k = np.arange(1, n_frames)
-    weights = 2 * (1 - k / n_frames)
-    sums = [weights @ np.interp(k * interval, times, correlation) for correlation in np.transpose(correlations)]
+    share = 2 * (1 - k / n_frames)
+    sums = [share @ np.interp(k * interval, times, correlation) for correlation in np.transpose(correlations)]
     return n_frames / (1 + np.maximum(sums, 0))

@@ -45,6 +45,7 @@ _CONVERGED = 1e-6  # squared step over the squared error from one frame
 _NEAR = 1e-2  # likewise: closer, the information is that of the solution
 _ITERATIONS = 20
 _RELINEARISE = 0.15  # change of log L0 that the derivative is not trusted with
+_REBUILD = 0.2  # likewise, single layers: only directions in which to look, once their sum is right
 _DIFFERENCE = 1.05  # of outer scales, for the derivative
 _STRIDE = 1.0  # of log L0 in an iteration, at most
 _EVERYWHERE = 0.1  # of the turbulence to start from: a layer without any is slow to gain some
@@ -168,7 +169,7 @@ class Fit:
         levels: (n_sensors,) noise variances over nominal ones.
         information: (n_layers + 1 + n_sensors,) squared: Fisher information of a frame about the strengths, L0^-1.5 and
             the levels, in this order.
-        bases: (n, n) of each of these parameters: the covariance's derivative.
+        bases: (n_parameters, n, n) the covariance's derivative by each of these.
         covariance: (n, n) of the slopes, rad^2.
         iterations: that it took.
     """
@@ -177,7 +178,7 @@ class Fit:
     outer_scale: float
     levels: Array
     information: Array
-    bases: Sequence[NDArray[np.float32]]
+    bases: NDArray[np.float32]
     covariance: Array
     iterations: int
 
@@ -199,28 +200,32 @@ def fit(
     n_layers = len(strengths)
     start = np.ones(len(model.noise)) if levels is None else levels
     shape = np.asarray(strengths, np.float64) / np.sum(strengths)
-    at = outer_scale  # that the bases belong to
-    layers = [model.layer(l, at) for l in range(n_layers)]
-    per_strength = shape @ [layer.trace() for layer in layers]
+    at = here = outer_scale  # that the layers' bases, and the sum's slope, belong to
+    bases = np.empty((n_layers + 1 + len(start), *S.shape), np.float32)
+    layers, slope, noise = bases[:n_layers], bases[n_layers], bases[n_layers + 1 :]
+    _build(layers, model, at)
+    noise[:] = model.noise
+    per_strength = shape @ layers.trace(axis1=1, axis2=2)
     trace = float(S.trace())
-    scale = max(trace - start @ [noise.trace() for noise in model.noise], 0.1 * trace) / per_strength
+    scale = max(trace - start @ noise.trace(axis1=1, axis2=2), 0.1 * trace) / per_strength
     theta = np.concatenate([scale * shape, [outer_scale**-_POWER], start])
     unseen = model.unseen(trace / len(S)).astype(np.float64)
     far = True
     for iteration in range(1, _ITERATIONS + 1):
         c, outer_scale, levels = theta[:n_layers], theta[n_layers] ** (-1 / _POWER), theta[n_layers + 1 :]
-        moved = not abs(math.log(outer_scale / at)) < _RELINEARISE
-        if moved:
+        if not abs(math.log(outer_scale / at)) < _REBUILD:
             at = outer_scale
-            layers = [model.layer(l, at) for l in range(n_layers)]
-        if moved or far:
+            _build(layers, model, at)
+        if far or not abs(math.log(outer_scale / here)) < _RELINEARISE:
+            here = outer_scale
+            of_layers = _total(layers, c)
+            turbulence = of_layers if math.isclose(here, at) else model.turbulence(c, here)
+            lack = turbulence - of_layers
             # nearly linear: a difference to one side will do
-            near = at / _DIFFERENCE
-            slope = model.turbulence(c, near) - _total(layers, c).astype(np.float32)
-            slope /= np.float32(near**-_POWER - at**-_POWER)
-        C = unseen + _total(layers, c) + _total(model.noise, levels)
-        C += (theta[n_layers] - at**-_POWER) * slope
-        bases = [*layers, slope, *model.noise]
+            near = here / _DIFFERENCE
+            slope[:] = model.turbulence(c, near) - turbulence
+            slope /= np.float32(near**-_POWER - here**-_POWER)
+        C: Array = lack + _total(bases, np.concatenate([c, [theta[n_layers] - here**-_POWER], levels])) + unseen
         try:
             inverse = inverse_of(C).astype(np.float32)
             if far:
@@ -249,12 +254,13 @@ def _sensible(strengths: Array, outer_scale: float) -> None:
         raise LearnError(f"no sky fits: an outer scale below {_OUTER_SCALES[0]:g} m")
 
 
-def _total(bases: Sequence[NDArray[np.float32]], factors: Array) -> Array:
-    out = np.zeros(bases[0].shape)
-    for basis, factor in zip(bases, factors, strict=True):
-        if factor:
-            out += np.float32(factor) * basis
-    return out
+def _build(out: NDArray[np.float32], model: SkyModel, outer_scale: float) -> None:
+    for l, layer in enumerate(out):
+        layer[:] = model.layer(l, outer_scale)
+
+
+def _total(bases: NDArray[np.float32], factors: Array) -> NDArray[np.float32]:
+    return np.asarray(np.tensordot(factors.astype(np.float32), bases, 1))
 
 
 def _within(theta: Array, aim: Array, n_layers: int) -> Array:
@@ -464,8 +470,9 @@ def _independent(
         coarse,
         found.strengths,
         found.outer_scale,
-        inverse_of(found.covariance),
-        [_total(found.bases, row).astype(np.float32) for row in influences],
+        found.covariance,
+        found.bases,
+        influences,
         velocity,
         min(part.place.size for part in model.sampling.parts),
         statistics.duration / (statistics.n_frames - 1),

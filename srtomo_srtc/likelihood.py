@@ -22,6 +22,8 @@ from scipy.optimize import nnls
 Array = NDArray[np.float64]
 Single = NDArray[np.float32]
 
+_ROWS = 16  # whose products are summed in float32
+
 
 def information(inverse: Single, bases: Sequence[Single | sparse.csr_array]) -> Array:
     """(n_parameters, n_parameters) F of one frame.
@@ -30,17 +32,20 @@ def information(inverse: Single, bases: Sequence[Single | sparse.csr_array]) -> 
         inverse: (n, n) C^-1.
         bases: (n, n) B_i of each parameter; a sparse one saves a product.
     """
-    F = np.empty((len(bases), len(bases)))
-    turned: list[Single] = []
-    for i, basis in enumerate(bases):
-        product = inverse @ basis
-        turned.append(np.ascontiguousarray(product.T))
-        for j, other in enumerate(turned):
-            F[i, j] = F[j, i] = 0.5 * _dot(product, other)
-    return F
+    n = len(inverse)
+    products = np.empty((len(bases), n, n), np.float32)
+    for basis, product in zip(bases, products):
+        product[:] = inverse @ basis
+    F = np.zeros((len(bases), len(bases)))
+    # not all rows: one sum in float32 would be too long
+    for start in range(0, n, _ROWS):
+        rows = slice(start, start + _ROWS)
+        turned = products[:, :, rows].transpose(0, 2, 1)
+        F += products[:, rows].reshape(len(F), -1) @ turned.reshape(len(F), -1).T
+    return 0.25 * (F + F.T)
 
 
-def score(inverse: Single, difference: Single, bases: Sequence[Single]) -> Array:
+def score(inverse: Single, difference: Single, bases: Sequence[Single] | Single) -> Array:
     """(n_parameters,) g of one frame.
 
     Args:
@@ -66,7 +71,8 @@ def inverse_of(C: Array) -> Array:
         raise np.linalg.LinAlgError("not positive definite")
     inverse, _ = lapack.dpotri(factor, lower=1, overwrite_c=1)
     lower = np.tril(inverse)
-    return np.asarray(lower + np.tril(lower, -1).T)
+    lower += np.tril(lower, -1).T
+    return np.asarray(lower)
 
 
 def non_negative_step(theta: Array, g: Array, F: Array) -> Array:

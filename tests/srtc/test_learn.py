@@ -400,13 +400,11 @@ def test_how_many_independent_frames_there_are(system: System) -> None:
     strengths = np.array([10.0, 5.0, 5.0])
     turbulence = model.turbulence(strengths, 25.0)
     C = turbulence + sum(model.noise) + model.unseen(1e-12)
-    influences = [turbulence, model.noise[0]]
+    bases, influences = [turbulence, model.noise[0]], np.eye(2)
 
     def frames(wind: float, interval: float) -> np.ndarray:
-        flow = wind * winds(system)
-        return independent_frames(
-            model, strengths, 25.0, inverse_of(C.astype(float)), influences, flow, 0.67, interval, 400
-        )
+        flow, covariance = wind * winds(system), C.astype(float)
+        return independent_frames(model, strengths, 25.0, covariance, bases, influences, flow, 0.67, interval, 400)
 
     assert frames(1, math.inf) == pytest.approx([400, 400])
     assert frames(1, 100.0) == pytest.approx([400, 400], rel=0.01)
@@ -416,7 +414,7 @@ def test_how_many_independent_frames_there_are(system: System) -> None:
     assert frames(1, 0.01)[1] > 3 * fast  # noise is new in every frame, and tells of itself
     # what no frame tells of, such as the share of a group that has it all, leaves the others' alone
     expected = frames(1, 0.01)
-    influences.insert(0, np.zeros_like(C))
+    influences = np.vstack([[0, 0], influences])
     assert frames(1, 0.01) == pytest.approx([400, *expected])
 
 
