@@ -107,7 +107,7 @@ class SkyModel:
         return self.seen(reduced)
 
     def _covariance(self, strengths: Array, outer_scale: float, layers: slice) -> Single:
-        out = np.zeros((len(self), len(self)), np.float32)
+        out = np.zeros((len(self), len(self)))
         table = _table(outer_scale, self._reach)
         for weight, lines in self._grids:
             turbulence = Turbulence(weight * np.asarray(strengths, np.float64), table)
@@ -116,12 +116,12 @@ class SkyModel:
 
     def seen(self, matrix: NDArray[np.floating]) -> Single:
         """``P matrix P``, (n, n): without the blind modes."""
-        blind, out = self.sampling.blind, np.array(matrix, np.float32)
+        blind, out = self.sampling.blind, np.array(matrix, np.float64)
         left, right = out @ blind, blind.T @ out
         right -= (blind.T @ left) @ blind.T
-        # both sides' in one product of thin matrices
-        out -= np.hstack([left, blind]).astype(np.float32) @ np.vstack([blind.T, right]).astype(np.float32)
-        return out
+        # both sides' in one product of thin matrices; in float32 what is left of the blind modes could be negative
+        out -= np.hstack([left, blind]) @ np.vstack([blind.T, right])
+        return out.astype(np.float32)
 
 
 def _table(outer_scale: float, reach: float) -> CovarianceTable:
