@@ -224,9 +224,10 @@ class Matrices:
         return out
 
     @property
-    def largest(self) -> int:
-        """Bytes of the largest of the tiles."""
-        return max(tiles.nbytes for tiles in (*self.R_tiles, self.Q_tiles))
+    def memory(self) -> tuple[NDArray[Any], ...]:
+        """All that a product reads."""
+        factors = self.factors.sensors if self.factors is not None else ()
+        return *self.R_tiles, self.Q_tiles, *(array for sensor in factors for array in sensor.memory)
 
     def warm(self) -> None:
         """Touch every byte."""

@@ -99,6 +99,7 @@ class SensorFactors:
 
     Attributes:
         scales: (n_rows,) of the rows of U.
+        memory: V and U of all zones.
         native: the frame path's; valid as long as this object.
     """
 
@@ -110,6 +111,7 @@ class SensorFactors:
         # one piece of memory each, in the order of use
         self._V = huge_zeros((sum(n * len(zone.columns) for n, zone in zip(inner, zones, strict=True)),), np.int16)
         self._U = huge_zeros((sum(ranks), _TILE), np.int16)
+        self.memory = self._V, self._U
         self._kept: list[object] = []
         made = (native.Zone * len(zones))()
         scratch = v = u = 0

@@ -295,18 +295,25 @@ class HrtcNode(LifecycleNode):
             self._clean_up()
             raise
         self._realtime = [
-            _BLAS,
+            realtime.read_blas(_BLAS),
             hot.outcome,
             multiplying,
             realtime.lock_memory(),
-            realtime.huge_pages(swap.largest_matrix),
+            realtime.huge_pages(swap.matrices()),
             realtime.quiet_interpreter(),
             realtime.fifo_priority(self._value("fifo_priority")),
             *self._pin_helpers(),
         ]
+        for outcome in self._realtime:
+            self._warn_of(outcome)
         # a manifest and blocks may have come while there was no memory for them
         if self._manifest is not None:
             self._begin(self._manifest)
+
+    def _warn_of(self, outcome: realtime.Outcome) -> None:
+        """Any thread."""
+        if not outcome.applied:
+            self.get_logger().warning(str(outcome))
 
     def _start_crew(self, swap: Swap, kernel: str, others: bool) -> realtime.Outcome:
         """Have the loop's products shared by as many threads as are asked for, or pay; what was measured."""
@@ -373,8 +380,8 @@ class HrtcNode(LifecycleNode):
                 outcome = realtime.Outcome(name, True, f"{seconds:g} s ({capacity / 2**20:.0f} MiB, {path.name})")
             except OSError as error:
                 outcome = realtime.Outcome(name, False, f"{error}; the recorder has to rely on its subscriptions")
-                self.get_logger().warning(str(outcome))
         hrtc.record_to(self._ring)
+        self._warn_of(outcome)
         self._realtime = [other for other in self._realtime if other.name != name] + [outcome]
 
     def _close_ring(self) -> None:
@@ -438,6 +445,7 @@ class HrtcNode(LifecycleNode):
         try:
             several = self._crew is not None and self._crew.threads > 1
             pinned = realtime.pin_thread(self._cores[:1] if several else self._cores)
+            self._warn_of(pinned)
             self._realtime = [outcome for outcome in self._realtime if outcome.name != pinned.name] + [pinned]
             hot.run(hrtc)
         except Exception:
@@ -821,6 +829,10 @@ class HrtcNode(LifecycleNode):
             self._hrtc.want_snapshot()
         status = DiagnosticStatus(name="hrtc", hardware_id=self.get_namespace())
         status.level, status.message = self._health()
+        refused = [outcome.name for outcome in self._realtime if not outcome.applied]
+        if refused and status.level == DiagnosticStatus.OK:
+            status.level = DiagnosticStatus.WARN
+            status.message += f"; refused by the system: {', '.join(refused)}"
         status.values = [KeyValue(key="lifecycle", value=self._lifecycle)] + [
             KeyValue(key=outcome.name, value=str(outcome)) for outcome in self._realtime
         ]

@@ -1,6 +1,6 @@
 """Real-time settings: each one applied, read back, and reported with the reason where the system refused.
 
-Import this module first: :func:`pin_blas` must run before numpy loads.
+Import this module first: :func:`pin_blas` must run before numpy loads, and :func:`read_blas` after it.
 """
 
 from __future__ import annotations
@@ -10,12 +10,15 @@ import gc
 import os
 import resource
 import sys
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import NamedTuple
 
 _BLAS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+_BLAS_COUNTS = tuple(
+    f"{prefix}openblas_get_num_threads{suffix}" for prefix in ("", "scipy_") for suffix in ("", "64_", "_64_")
+)  # as the wheels of numpy and scipy, and distributions, name it
 _MCL_CURRENT, _MCL_FUTURE = 1, 2
 
 HUGE_PAGE = 2 << 20
@@ -34,7 +37,10 @@ class Outcome(NamedTuple):
 
 
 def pin_blas(threads: int = 1) -> Outcome:
-    """Set the number of BLAS threads; refused when numpy is loaded already and another number was in force."""
+    """Ask for a number of BLAS threads; refused when numpy is loaded already and another number was in force.
+
+    Whether BLAS heeds it, :func:`read_blas` tells.
+    """
     name = "blas threads"
     in_force = os.environ.get(_BLAS[0])
     if "numpy" in sys.modules and in_force != str(threads):
@@ -42,6 +48,31 @@ def pin_blas(threads: int = 1) -> Outcome:
     for variable in _BLAS:
         os.environ[variable] = str(threads)
     return Outcome(name, True, str(threads))
+
+
+def read_blas(asked: Outcome, threads: int = 1) -> Outcome:
+    """The number of threads that every OpenBLAS of the process says it uses, once numpy is loaded.
+
+    Args:
+        asked: what :func:`pin_blas` gave, which stands where no OpenBLAS is found to be asked.
+        threads: that it was given.
+    """
+    found = set()
+    # numpy and scipy bring one each
+    for library in {line.split(maxsplit=5)[-1].strip() for line in _memory_map() if "openblas" in line}:
+        with suppress(OSError):
+            loaded = ctypes.CDLL(library)
+            found |= {int(getattr(loaded, name)()) for name in _BLAS_COUNTS if hasattr(loaded, name)}
+    if not found:
+        return asked._replace(detail=f"{asked.detail}, set and not read back: no OpenBLAS") if asked.applied else asked
+    if found == {threads}:
+        return Outcome(asked.name, True, str(threads))
+    reason = f", {asked.detail}" if not asked.applied else ""
+    return Outcome(asked.name, False, f"OpenBLAS uses {', '.join(map(str, sorted(found)))}{reason}")
+
+
+def _memory_map() -> list[str]:
+    return Path("/proc/self/maps").read_text(encoding="utf-8", errors="replace").splitlines()
 
 
 def lock_memory() -> Outcome:
@@ -65,23 +96,42 @@ def _kibibytes(file: str, field: str) -> int:
     return 0
 
 
-def huge_pages(largest: int) -> Outcome:
-    """What of the process's memory is on huge pages: matrices ask for them when they are made, if they fill one.
+def huge_pages(matrices: Iterable[tuple[int, int]]) -> Outcome:
+    """What of the matrices is on huge pages: they ask for them when they are made, if they fill one.
 
     Args:
-        largest: of the matrices, bytes.
+        matrices: address and bytes of each. What was not touched yet is not there, and not counted.
     """
-    huge = _kibibytes("smaps_rollup", "AnonHugePages")
-    if huge:
-        return Outcome("huge pages", True, f"{huge >> 10} MiB")
-    if largest < HUGE_PAGE:
+    matrices = list(matrices)
+    large = [(start, start + size) for start, size in matrices if size >= HUGE_PAGE]
+    if not large:
+        largest = max((size for _, size in matrices), default=0)
         return Outcome("huge pages", True, f"not needed: no matrix fills one ({largest / 2**20:.1f} MiB at most)")
+    huge, there = _pages_of(large)
+    if huge:
+        return Outcome("huge pages", True, f"{huge >> 10} MiB of {there >> 10} MiB of matrices")
     setting = Path("/sys/kernel/mm/transparent_hugepage/enabled")
     try:
         reason = f"{setting} says {setting.read_text(encoding='ascii').strip()}"
     except OSError:
         reason = "this system has none"
     return Outcome("huge pages", False, reason)
+
+
+def _pages_of(ranges: Collection[tuple[int, int]]) -> tuple[int, int]:
+    """KiB on huge pages, and in memory at all, of the mappings that hold these ranges of addresses."""
+    huge = there = 0
+    counted = False
+    for line in Path("/proc/self/smaps").read_text(encoding="utf-8", errors="replace").splitlines():
+        word, *rest = line.split()
+        if not word.endswith(":"):
+            start, end = (int(address, 16) for address in word.split("-"))
+            counted = any(start < last and first < end for first, last in ranges)
+        elif counted and word == "AnonHugePages:":
+            huge += int(rest[0])
+        elif counted and word == "Rss:":
+            there += int(rest[0])
+    return huge, there
 
 
 def pin_thread(cores: Collection[int], thread: int = 0, name: str = "affinity of the loop") -> Outcome:

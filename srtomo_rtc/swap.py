@@ -367,7 +367,6 @@ class Swap:
 
     Attributes:
         settings, active, staged, previous: what the loop is to run, and what may be committed or rolled back to.
-        largest_matrix: of one sensor's or Q's, bytes.
 
     Raises:
         ValueError: G_cal is not of the instrument's shape.
@@ -393,7 +392,6 @@ class Swap:
         self._post = post
         self._max_epochs, self._max_closures = max_epochs, max_closures
         self._slots = [Slot(layout, max_epochs, kernel) for _ in range(3)]
-        self.largest_matrix = max(slot.epochs[0].largest for slot in self._slots)
         self._manifest: Manifest | None = None
         self._R = np.zeros((n_parts(max_epochs), layout.n_commands, layout.n_slopes), np.float32)
         self._Q = np.zeros((n_parts(max_epochs), layout.n_commands, layout.n_commands), np.float32)
@@ -540,6 +538,11 @@ class Swap:
         if self._kernel == "tlr":
             return Matrices(self._layout, "int16").R_tiles
         return self._free().epochs[0].R_tiles
+
+    def matrices(self) -> list[tuple[int, int]]:
+        """Address and bytes of each of the matrices of all slots."""
+        parts = {id(part): part for slot in self._slots for part in (*slot.epochs, slot.fallback)}
+        return [(array.ctypes.data, array.nbytes) for part in parts.values() for array in part.memory]
 
     def _check_epochs(self, n_epochs: int) -> None:
         if not 1 <= n_epochs <= self._max_epochs:

@@ -57,8 +57,10 @@ def huge_zeros(shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
     size = int(np.prod(shape)) * np.dtype(dtype).itemsize
     if size < HUGE_PAGE:
         return np.zeros(shape, dtype)
-    # from one boundary to another: the system makes a page huge only if all of it is the array's
-    memory = mmap.mmap(-1, -(-size // HUGE_PAGE) * HUGE_PAGE + HUGE_PAGE)
+    # From one boundary to another: the system makes a page huge only if all of it is the array's. Private: shared
+    # memory, mmap's default, follows another setting of the system's, which is "never" unless somebody changes it.
+    flags = mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS
+    memory = mmap.mmap(-1, -(-size // HUGE_PAGE) * HUGE_PAGE + HUGE_PAGE, flags=flags)
     if hasattr(mmap, "MADV_HUGEPAGE"):
         memory.madvise(mmap.MADV_HUGEPAGE)
     start = -np.frombuffer(memory, np.uint8).ctypes.data % HUGE_PAGE

@@ -223,10 +223,10 @@ def matrix_file(tmp_path_factory, mini):
 def start(start_shared_process, matrix_file):
     """Starts an HRTC in a namespace."""
 
-    def start(namespace: str, *parameters: str):
+    def start(namespace: str, *parameters: str, first: Sequence[str] = ()):
         words = [f"interaction_matrix:={matrix_file}", "system:=mini", f"fault_budget:={BUDGET}", *parameters]
         return start_shared_process(
-            *("-m", "srtomo_rtc.node", "--ros-args", "-r", f"__ns:=/{namespace}"),
+            *(*first, "-m", "srtomo_rtc.node", "--ros-args", "-r", f"__ns:=/{namespace}"),
             *[word for parameter in words for word in ("-p", parameter)],
         )
 
@@ -287,6 +287,31 @@ def make_sure_it_is_closed(loop: Wire) -> None:
     if loop.status().loop_state != HrtcEvent.CLOSED:
         loop.operator.close_loop(True)
     assert loop.run(5)[-1] == Verdict.OK
+
+
+# -- settings --------------------------------------------------------------------------------------------------------
+
+# What follows runs as a user without privileges does: neither CAP_IPC_LOCK nor CAP_SYS_NICE, nor limits instead.
+UNPRIVILEGED = """
+import ctypes, os, resource, sys
+for capability in (14, 23):
+    ctypes.CDLL(None).prctl(24, capability, 0, 0, 0)
+resource.setrlimit(resource.RLIMIT_RTPRIO, (0, 0))
+resource.setrlimit(resource.RLIMIT_MEMLOCK, (1 << 20, 1 << 20))
+os.execv(sys.executable, [sys.executable, *sys.argv[1:]])
+"""
+
+
+def test_what_the_system_refuses_is_warned_of_and_the_loop_runs(start, wired, first_matrix):
+    process = start("unprivileged", f"reconstructor:={first_matrix}", "fifo_priority:=10", first=("-c", UNPRIVILEGED))
+    loop = wired("unprivileged")
+    for name, reason in (("memory lock", ""), ("SCHED_FIFO", "RLIMIT_RTPRIO")):
+        (line,) = [line for line in process.output.splitlines() if f"{name} refused: " in line]
+        assert "[WARN]" in line and reason in line
+    assert "blas threads 1;" in loop.status().realtime
+    assert loop.diagnosis("waiting for slopes; refused by the system: memory lock, SCHED_FIFO") == 1
+    make_sure_it_is_closed(loop)
+    assert process.terminate() == 0, process.output
 
 
 # -- slopes ----------------------------------------------------------------------------------------------------------
