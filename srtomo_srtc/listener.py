@@ -12,7 +12,7 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
 from srtomo_core import wire
-from srtomo_srtc.telemetry import Statistics, Telemetry
+from srtomo_srtc.telemetry import NoWindow, Statistics, Telemetry
 
 _PERIOD = 0.01  # s between visits
 _BRIDGED = 5.0  # s of messages that wait while a window's statistics are put together, or others have the machine
@@ -29,7 +29,8 @@ class Listener(threading.Thread):
         n_sensors: of the instrument: so many messages a frame there are at most, packets aside.
 
     Attributes:
-        windows: what :meth:`ask` asked for; or, as text, why there is none.
+        windows: what :meth:`ask` asked for; or why there is none.
+        failure: what ended the thread before :meth:`finish`; empty while it goes on.
     """
 
     def __init__(self, node: Node, telemetry: Telemetry, rate: float, n_sensors: int) -> None:
@@ -43,7 +44,9 @@ class Listener(threading.Thread):
             qos = QoSProfile(**topic.qos(max(topic.depth, round(_BRIDGED * rate * per_frame))))
             subscription = node.create_subscription(kind, topic.name, lambda _: None, qos, raw=True)
             self._taps.append((subscription, kind, put, _ROUND * per_frame))
-        self.windows: queue.SimpleQueue[Statistics | str] = queue.SimpleQueue()
+        self.windows: queue.SimpleQueue[Statistics | NoWindow] = queue.SimpleQueue()
+        self.failure = ""
+        self._given = 0, -1  # session and last frame of the window that was given last
         self._asked = threading.Event()
         self._stopped = threading.Event()
 
@@ -63,16 +66,38 @@ class Listener(threading.Thread):
 
     def run(self) -> None:
         """The thread's body."""
+        try:
+            self._listen()
+        except Exception as error:  # whatever it is: nothing is learned any more, and the reason is told
+            self.failure = f"telemetry has ended: {type(error).__name__}: {error}"
+            self.windows.put(NoWindow(self.failure, *self._given))
+
+    def _listen(self) -> None:
+        answered, came = self._telemetry.newest, time.monotonic()
         while not self._stopped.is_set():
             while any([self._take(*tap) for tap in self._taps]):
                 pass
+            if self._telemetry.newest != answered:
+                answered, came = self._telemetry.newest, time.monotonic()
+            self._telemetry.age(time.monotonic() - came)
             if self._asked.is_set():
                 self._asked.clear()
-                try:
-                    self.windows.put(self._telemetry.statistics())
-                except ValueError as error:
-                    self.windows.put(str(error))
+                self.windows.put(self._window())
             time.sleep(_PERIOD)
+
+    def _window(self) -> Statistics | NoWindow:
+        """The window as it stands, once."""
+        try:
+            window = self._telemetry.statistics()
+        except NoWindow as why:
+            return why
+        except MemoryError as error:  # there may be some for the next one
+            return self._telemetry.refusal(f"MemoryError: {error}")
+        last = window.session, window.last_frame
+        if last == self._given:
+            return self._telemetry.refusal("no new frame to count")
+        self._given = last
+        return window
 
     @staticmethod
     def _take(subscription: Any, kind: type, put: Any, most: int) -> bool:

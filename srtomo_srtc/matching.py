@@ -140,6 +140,12 @@ class Matcher:
         """The current session; 0 before the first command."""
         return self._current
 
+    @property
+    def newest(self) -> int:
+        """The newest frame of the current session that was answered, whether it was put together or not; or -1."""
+        session = self._sessions.get(self._current)
+        return -1 if session is None else session.newest
+
     def add_slopes(self, message: bytes | SlopeFrame) -> None:
         """Take a SlopeFrame, serialised or read; its slopes are copied."""
         if not isinstance(message, SlopeFrame):

@@ -51,8 +51,8 @@ from srtomo_srtc.listener import Listener
 from srtomo_srtc.model import ground_prior
 from srtomo_srtc.reconstructors import implicit, predictive
 from srtomo_srtc.registration import registered_layout, with_places
-from srtomo_srtc.report import believed_fields, diagnosis, health_fields, learned_fields
-from srtomo_srtc.telemetry import COUNTED_RATE, Statistics, Telemetry
+from srtomo_srtc.report import believed_fields, diagnosis, health_fields, learned_fields, refusal_fields
+from srtomo_srtc.telemetry import COUNTED_RATE, NoWindow, Statistics, Telemetry
 from srtomo_srtc.wind import effective_lag
 from srtomo_srtc.worker import Worker
 
@@ -317,7 +317,7 @@ class SrtcNode(Node):
     def _follow(self, listener: Listener, worker: Worker) -> None:
         """Hand windows to the worker, and act on what it makes of them."""
         now = time.monotonic()
-        if not self._judging and now - self._last_asked >= self._window:
+        if not (self._judging or listener.failure) and now - self._last_asked >= self._window:
             self._last_asked, self._judging = now, True
             listener.ask()
         if not listener.windows.empty():
@@ -326,19 +326,29 @@ class SrtcNode(Node):
                 worker.judge(window)
             else:
                 self._judging = False
-                self._told(1, window)
+                self._refused(window)
         if not worker.judgements.empty():
             self._judging = False
             self._act_on(worker.judgements.get())
+
+    def _refused(self, why: NoWindow) -> None:
+        """There is no window to judge."""
+        active = 0 if self._status is None else self._status.reconstructor
+        sources = {belief.reconstructor.id: belief.source for belief in self._built.values()}
+        self._send_health(refusal_fields(why, active, sources.get(active, "")))
+        self._told(1, str(why))
+
+    def _send_health(self, fields: dict[str, Any]) -> None:
+        message = ModelHealth(**fields)
+        message.header.stamp = self.get_clock().now().to_msg()
+        self._healths.publish(message)
 
     def _act_on(self, judgement: Judgement) -> None:
         candidate = judgement.candidate
         if judgement.sky is not None:
             identity = candidate.reconstructor.id if candidate is not None else 0
             self._send_profile(_LEARNED, identity, learned_fields(self._system, judgement.sky, judgement.window))
-        message = ModelHealth(**health_fields(judgement))
-        message.header.stamp = self.get_clock().now().to_msg()
-        self._healths.publish(message)
+        self._send_health(health_fields(judgement))
         self._told(*diagnosis(judgement))
         if judgement.outcome is Outcome.PUBLISHED and candidate is not None:
             self._built[_LEARNED] = candidate
@@ -391,7 +401,7 @@ class SrtcNode(Node):
             self._told(2, f"could not {order.text}: {response and response.message}")
 
     def _diagnose(self, listener: Listener) -> None:
-        level, reason = self._reason
+        level, reason = (2, listener.failure) if listener.failure else self._reason
         status = DiagnosticStatus(name="srtc", hardware_id=self.get_namespace(), level=bytes([level]), message=reason)
         status.values = [KeyValue(key=f"frames {name}", value=str(count)) for name, count in listener.counts.items()]
         message = DiagnosticArray(status=[status])

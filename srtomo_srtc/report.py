@@ -10,7 +10,7 @@ import numpy as np
 from srtomo_core.system import System
 from srtomo_srtc.learn import winds_at
 from srtomo_srtc.learner import Judgement, LearnedSky, Outcome
-from srtomo_srtc.telemetry import Statistics
+from srtomo_srtc.telemetry import NoWindow, Statistics
 
 
 def believed_fields(system: System) -> dict[str, Any]:
@@ -113,6 +113,24 @@ def health_fields(judgement: Judgement) -> dict[str, Any]:
         before, after = judgement.predicted
         fields["predicted_gain"] = math.copysign(math.sqrt(abs(before**2 - after**2)), before - after)
     return fields
+
+
+def refusal_fields(why: NoWindow, reconstructor: int, source: str) -> dict[str, Any]:
+    """Fields of a ModelHealth where there was no window to judge: its frames are the newest one that was answered.
+
+    Args:
+        reconstructor, source: that is active; 0 and "" for none, or none that is known.
+    """
+    frame = max(why.frame, 0)
+    return {
+        "session": why.session,
+        "first_frame": frame,
+        "last_frame": frame,
+        "reconstructor": reconstructor,
+        "source": source,
+        "decision": int(Outcome.FAILED),
+        "text": str(why),
+    }
 
 
 def diagnosis(judgement: Judgement) -> tuple[int, str]:

@@ -6,8 +6,9 @@ y are the slopes as measured, m~ what was on the mirrors in that exposure, whate
 clipped or offset. P takes the blind modes of each sensor out.
 
 The window is a ring of blocks of equal time. Of every block the last part is held out, for models to be judged by
-frames that they were not fitted to; block by block its moments stay apart, for a jackknife. Every q-th exposure counts:
-successive frames say nearly the same of the turbulence, and noise is learned from few.
+frames that they were not fitted to. Blocks leave the window as frames are answered and time passes, whether new ones
+count or not. Every q-th exposure counts: successive frames say nearly the same of the turbulence, and noise is learned
+from few.
 """
 
 from __future__ import annotations
@@ -46,19 +47,18 @@ HELD_OUT = 0.2
 _BATCH = 256  # rows that become pseudo-open-loop slopes at a time: enough for products to run at full speed
 
 
-@dataclass(frozen=True, eq=False)
-class Moments:
-    """First and second moments of some frames.
+class NoWindow(ValueError):
+    """There is no window to learn from; the text says why.
 
     Attributes:
-        covariance: (n_slopes, n_slopes) about ``mean``, divided by the number of frames, rad^2.
-        mean: (n_slopes,) rad. ``covariance + outer(mean, mean)`` is the second moment about zero.
-        n_frames: how many.
+        session: the current one, 0 before any.
+        frame: the newest of it that was answered, or -1.
     """
 
-    covariance: NDArray[np.float32]
-    mean: NDArray[np.float64]
-    n_frames: int
+    def __init__(self, reason: str, session: int, frame: int) -> None:
+        super().__init__(reason)
+        self.session = session
+        self.frame = frame
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,26 +84,30 @@ class HeldOut:
 
 
 @dataclass(frozen=True, eq=False)
-class Statistics(Moments):
-    """Second moments of pseudo-open-loop slopes ``s = P (y + G m~)`` over a window.
+class Statistics:
+    """First and second moments of pseudo-open-loop slopes ``s = P (y + G m~)`` over a window.
 
     P takes the blind modes (a laser star's tip-tilt) out of each frame; m~ is what was on the mirrors in the exposure.
 
     Attributes:
+        covariance: (n_slopes, n_slopes) about ``mean``, divided by the number of frames, rad^2.
+        mean: (n_slopes,) rad. ``covariance + outer(mean, mean)`` is the second moment about zero.
+        n_frames: how many.
         interval: s between counted frames (they may be every q-th exposure).
         duration: s from the window's first counted frame to its last.
         lagged: lag in exposures to (n_slopes, n_slopes) <s[k] s[k-lag]^T> about ``mean``, rad^2.
         lagged_frames: lag to the number of pairs in it.
-        blocks: the moments of successive stretches of the window; pooled they are the window's.
         held_out: frames that are in none of these.
         session, first_frame, last_frame: the exposures that the window spans.
     """
 
+    covariance: NDArray[np.float32]
+    mean: NDArray[np.float64]
+    n_frames: int
     interval: float
     duration: float
     lagged: Mapping[int, NDArray[np.float32]]
     lagged_frames: Mapping[int, int]
-    blocks: tuple[Moments, ...]
     held_out: HeldOut
     session: int
     first_frame: int
@@ -134,25 +138,30 @@ class _Block:
         self.lagged_frames[lag] += len(rows)
         self.lagged[lag] = sgemm(1.0, rows.T, earlier.T, beta=1.0, c=self.lagged[lag], trans_b=1, overwrite_c=1)
 
-    def moments(self) -> Moments:
-        return _moments(self.squares, self.sum, self.n_frames)
+
+def _pooled(sums: list[Floats], n_frames: int, mean: NDArray[np.float64]) -> Floats:
+    """Second moment about the mean, from blocks' sums of products; with memory for the result alone."""
+    moment = np.zeros_like(sums[0])
+    for products in sums:
+        moment += products
+    moment /= np.float32(n_frames)
+    for j, one in enumerate(mean):
+        moment[:, j] -= (mean * one).astype(np.float32)
+    return moment
 
 
-def _moments(squares: Floats, total: NDArray[np.float64], n_frames: int) -> Moments:
-    """From sums; of ``squares`` only the upper triangle counts."""
-    mean = total / n_frames
-    squares = squares / np.float32(n_frames)
-    squares -= np.outer(mean, mean).astype(np.float32)
-    upper = np.triu(squares)
-    upper += np.triu(squares, 1).T
-    return Moments(upper, mean, n_frames)
+def _mirrored(upper: Floats) -> Floats:
+    """Itself, with the upper triangle in the lower one's place as well."""
+    for j in range(1, len(upper)):
+        upper[j, :j] = upper[:j, j]
+    return upper
 
 
 class Telemetry:
     """Accumulates :class:`Statistics` from SlopeFrames and DmCommands. One thread calls everything.
 
-    Memory: ``4 n_slopes^2`` bytes a block, as many for each lag in it, as many for its moments once they are asked for;
-    and some for batches and held-out frames.
+    Memory: ``4 n_slopes^2`` bytes a block, the one being filled included, and as many for each lag in it; once more for
+    the window's moments when they are asked for; and some for batches and held-out frames.
 
     Attributes:
         every: exposures from one counted frame to the next.
@@ -200,8 +209,8 @@ class Telemetry:
         self._lags = tuple(sorted(set(lags)))
         n, m = G.shape
         require(
-            4.0 * n * n * (blocks + 1) * (2 + len(lags))
-            + 8.0 * n * (self._block_length - self._fit_length) * (blocks + 1)
+            4.0 * n * n * (blocks + 2) * (1 + len(self._lags))
+            + 16.0 * n * (self._block_length - self._fit_length) * (blocks + 1)
             + 4.0 * (4 * n + m) * _BATCH,
             f"telemetry of {system.name}",
         )
@@ -210,7 +219,10 @@ class Telemetry:
         self._blind = np.ascontiguousarray(blind_modes(system, layout), np.float32)
         self._matcher = Matcher(layout, self._is_wanted)
         self._measured, self._mirror = np.empty((_BATCH, n), np.float32), np.empty((_BATCH, m), np.float32)
-        self._blocks: deque[_Block] = deque(maxlen=blocks + 1)  # the last one is being filled
+        self._n_blocks = blocks
+        self._blocks: deque[_Block] = deque()  # the last one is being filled
+        self._last = 0, -1  # session and frame that were put together
+        self._tally_then = vars(self.tally).copy()
         self.restart()
 
     def restart(self) -> None:
@@ -225,6 +237,11 @@ class Telemetry:
     def tally(self) -> Tally:
         """What became of the frames asked for so far."""
         return self._matcher.tally
+
+    @property
+    def newest(self) -> tuple[int, int]:
+        """The session that commands come for, and its newest frame that was answered; 0 and -1 before."""
+        return self._matcher.session, self._matcher.newest
 
     def add_slopes(self, message: bytes | SlopeFrame) -> None:
         """Take a SlopeFrame, serialised or read."""
@@ -246,37 +263,65 @@ class Telemetry:
             (self.add_slopes if message.topic == slopes else self.add_command)(message.data)
         self._take(final=True)
 
+    def age(self, idle: float = 0.0) -> None:
+        """Drop what has left the window; to be called where time passes without commands.
+
+        Args:
+            idle: s since the last command came.
+        """
+        if self._session not in (0, self._matcher.session):
+            self.restart()  # commands come for another session, of which no frame is put together yet
+        frames = round(idle / self._period)
+        if frames >= self._block_length * self.every:
+            self._flush()  # or the batch would be counted when it is old
+        self._drop(self._place(self._matcher.newest + frames)[0])
+
+    def refusal(self, what: str) -> NoWindow:
+        """Why there is no window, with what became of the frames since the last one that was put together.
+
+        Args:
+            what: is wrong, in few words.
+        """
+        tally, (session, newest), (last_session, last) = vars(self.tally), self.newest, self._last
+        why = [
+            f"{name.replace('_', ' ')} {count - self._tally_then[name]}"
+            for name, count in tally.items()
+            if count > self._tally_then[name] and name not in ("matched", "open", "held", "clipped", "sessions")
+        ]
+        where = f" in the last of {tally['sessions']} sessions" if tally["sessions"] > 1 else ""
+        since = f"since frame {last}" if session and session == last_session else "so far"
+        return NoWindow(f"telemetry: {what}{where}; {since}: {', '.join(why) or 'nothing came'}", session, newest)
+
     def statistics(self) -> Statistics:
         """The moments of the window as it stands.
 
         Raises:
-            ValueError: fewer than two frames were counted in it.
+            NoWindow: fewer than two frames were counted in it.
         """
         self._flush()
+        self.age()
         blocks = [block for block in self._blocks if block.n_frames]
         n_frames = sum(block.n_frames for block in blocks)
         if n_frames < 2:
-            raise ValueError(f"telemetry: expected at least 2 frames to count, got {n_frames}")
-        squares = np.sum([block.squares for block in blocks], axis=0)
-        pooled = _moments(squares, np.sum([block.sum for block in blocks], axis=0), n_frames)
+            raise self.refusal(f"expected at least 2 frames to count, got {n_frames}")
+        mean = np.sum([block.sum for block in blocks], axis=0) / n_frames
+        covariance = _mirrored(_pooled([block.squares for block in blocks], n_frames, mean))
         lagged: dict[int, NDArray[np.float32]] = {}
         lagged_frames: dict[int, int] = {}
         for lag in self._lags:
             pairs = sum(block.lagged_frames[lag] for block in blocks)
             if pairs:
                 lagged_frames[lag] = pairs
-                moment = np.sum([block.lagged[lag] for block in blocks], axis=0) / np.float32(pairs)
-                lagged[lag] = np.asarray(moment - np.outer(pooled.mean, pooled.mean), np.float32)
+                lagged[lag] = _pooled([block.lagged[lag] for block in blocks], pairs, mean)
         first, last = blocks[0].first_frame, blocks[-1].last_frame
         return Statistics(
-            pooled.covariance,
-            pooled.mean,
+            covariance,
+            mean,
             n_frames,
             interval=self.every * self._period,
             duration=(last - first) * self._period,
             lagged=lagged,
             lagged_frames=lagged_frames,
-            blocks=tuple(block.moments() for block in blocks),
             held_out=self._held_out(),
             session=self._session,
             first_frame=first,
@@ -305,7 +350,8 @@ class Telemetry:
         return block, place >= self._fit_length
 
     def _take(self, final: bool = False) -> None:
-        for exposure in self._matcher.take(final):
+        taken = self._matcher.take(final)
+        for exposure in taken:
             if exposure.session != self._session:
                 # frame numbers begin anew: the window does too
                 self._flush()
@@ -314,6 +360,8 @@ class Telemetry:
             self._batch.append(exposure)
             if len(self._batch) == _BATCH:
                 self._flush()
+        if taken:
+            self._last, self._tally_then = (taken[-1].session, taken[-1].frame), vars(self.tally).copy()
 
     def _flush(self) -> None:
         """Turn the batch into rows of pseudo-open-loop slopes, and count these."""
@@ -364,8 +412,11 @@ class Telemetry:
 
     def _block(self, index: int) -> _Block:
         if not self._blocks or self._blocks[-1].index != index:
-            # blocks that a gap has left empty are gone from the window all the same
-            while self._blocks and self._blocks[0].index < index + 1 - (self._blocks.maxlen or 0):
-                self._blocks.popleft()
+            self._drop(index)
             self._blocks.append(_Block(index, len(self._blind), self._lags))
         return self._blocks[-1]
+
+    def _drop(self, index: int) -> None:
+        """Drop the blocks that have left a window whose block ``index`` is the one being filled."""
+        while self._blocks and self._blocks[0].index < index - self._n_blocks:
+            self._blocks.popleft()

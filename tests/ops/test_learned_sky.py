@@ -56,7 +56,7 @@ class Telescope(Plant):
         nothing = HeldOut(*(np.empty((0, n), np.float32),) * 2, *(np.empty(0, int),) * 3)
         moment = frames.T @ frames / np.float32(len(frames))
         span = (len(frames) - 1) / rate
-        return Statistics(moment, np.zeros(n), len(frames), 1 / rate, span, {}, {}, (), nothing, 1, 0, 1)
+        return Statistics(moment, np.zeros(n), len(frames), 1 / rate, span, {}, {}, nothing, 1, 0, 1)
 
 
 def noise_factors(true: System, file: System) -> list[float]:

@@ -184,10 +184,6 @@ def test_statistics_are_those_of_the_untouched_sky(mini: System, sky: Sky, messa
     assert statistics.held_out.frames[statistics.held_out.reconstructor > 0].tolist() == answered
     assert len(set(statistics.held_out.reconstructor)) == 3
     assert (statistics.first_frame, statistics.last_frame) == (fit[0], fit[-1])
-    # pooled, the blocks are the window
-    n = [block.n_frames for block in statistics.blocks]
-    second = sum(b.n_frames * (b.covariance + np.outer(b.mean, b.mean)) for b in statistics.blocks) / sum(n)
-    assert second - np.outer(statistics.mean, statistics.mean) == pytest.approx(statistics.covariance, abs=1e-5 * scale)
 
 
 def test_the_window_forgets(mini: System, sky: Sky, messages) -> None:

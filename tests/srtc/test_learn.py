@@ -61,7 +61,6 @@ def statistics(moment: np.ndarray, n_frames: int, interval: float = math.inf) ->
         interval * (n_frames - 1),
         {},
         {},
-        (),
         nothing,
         1,
         0,

@@ -38,7 +38,7 @@ def window() -> Statistics:
         block=np.arange(80) // 10,
         reconstructor=np.zeros(80, np.uint64),
     )
-    return Statistics(np.eye(N, dtype=np.float32), np.zeros(N), 500, 0.008, 4.0, {}, {}, (), held, 7, 100, 1100)
+    return Statistics(np.eye(N, dtype=np.float32), np.zeros(N), 500, 0.008, 4.0, {}, {}, held, 7, 100, 1100)
 
 
 def sent(kind: str, fields: dict[str, Any]) -> Any:
