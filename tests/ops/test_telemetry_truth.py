@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+import srtomo_srtc.telemetry
 from srtomo_core.bag import BagReader
 from srtomo_core.layout import Layout
 from srtomo_core.reconstructor import Reconstructor
@@ -19,7 +21,7 @@ from srtomo_sim.plant import Plant
 from srtomo_sim.sky import Sky, prepare
 from srtomo_srtc.matching import HORIZON, Matched, Matcher
 from srtomo_srtc.model import blind_modes
-from srtomo_srtc.telemetry import Telemetry
+from srtomo_srtc.telemetry import NoWindow, Telemetry
 
 BAG = Path(__file__).resolve().parents[2] / "bags" / "mini"
 FRAMES = 400
@@ -195,6 +197,66 @@ def test_the_window_forgets(mini: System, sky: Sky, messages) -> None:
     assert len(statistics.held_out.frames) == 0
 
 
+def _with_closed(messages, said: dict[int, tuple[int, int]]):
+    """The same, where some frames' answers say another verdict and set of sensors."""
+    writer = None
+    for is_slopes, data in messages:
+        if not is_slopes and (answer := read_dm_command(data)).frame in said:
+            verdict, sensors = said[answer.frame]
+            writer = writer or DmCommandWriter("hrtc", len(answer.commands))
+            writer.values[:] = answer.commands
+            data = writer.write(*answer._replace(verdict=verdict, sensors=sensors)[:-1])
+        yield is_slopes, data
+
+
+def test_the_window_ages_while_no_frame_counts(mini: System, sky: Sky, messages) -> None:
+    """With a sensor closed, and with nothing at all."""
+    per_frame, options = len(sky.layout.sensors) + 1, {"window": 0.5, "blocks": 2, "every": 1, "held_out": 0.0}
+    closed = list(_with_closed(messages, {k: (0, 0b1101) for k in range(200, FRAMES)}))
+    telemetry = Telemetry(mini, sky.interaction, **options)
+    _put(telemetry, closed[: 280 * per_frame])
+    # the block of 50 frames being filled is the one of frame 279, and two whole ones are before it
+    assert telemetry.statistics().first_frame == 150
+    _put(telemetry, closed[280 * per_frame :])
+    with pytest.raises(NoWindow, match=r"2 frames to count, got 0; since frame 199: sensor closed 200$") as told:
+        telemetry.statistics()
+    assert (told.value.session, told.value.frame) == (7, FRAMES - 1)
+
+    telemetry = Telemetry(mini, sky.interaction, **options)
+    _put(telemetry, messages[: 200 * per_frame])
+    telemetry.age(0.4)
+    assert telemetry.statistics().first_frame == 150
+    _put(telemetry, messages[200 * per_frame : 210 * per_frame])
+    telemetry.age(1.0)
+    with pytest.raises(NoWindow, match=r"got 0; since frame 209: nothing came$"):
+        telemetry.statistics()
+
+
+def test_it_needs_the_memory_that_it_asks_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not less, and not much more: with as many slopes as make matrices count."""
+    system = load_system("mini", {f"sensors.{w}.subapertures": 18 for w in range(3)})
+    layout, stated = Layout(system), []
+    monkeypatch.setattr(srtomo_srtc.telemetry, "require", lambda n_bytes, _: stated.append(n_bytes))
+    G = np.zeros((layout.n_slopes, layout.n_commands), np.float32)
+    writers = [
+        SlopeFrameWriter(place.name, 7, layout.fingerprint, w, 1, place.n_valid)
+        for w, place in enumerate(layout.sensors)
+    ]
+    answers = DmCommandWriter("hrtc", layout.n_commands)
+    tracemalloc.start()
+    telemetry = Telemetry(system, G, window=0.2, blocks=8, every=1, lags=(2,))
+    for k in range(45):
+        for writer in writers:
+            telemetry.add_slopes(writer.write(k, k, -1, -1, 1.0))
+        telemetry.add_command(answers.write(0, k, 7, k, 1, 1, 15, 0, True, 0, 0.5, -1, -1, -1, 1.0, 0.0))
+    statistics = telemetry.statistics()
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    print(layout.n_slopes, peak / stated[0])
+    assert statistics.n_frames == 36 and len(statistics.held_out.frames) == 9
+    assert 0.7 * stated[0] < peak < 1.1 * stated[0]
+
+
 def test_gaps_are_left_out_and_counted(sky: Sky, messages) -> None:
     per_frame = len(sky.layout.sensors) + 1
 
@@ -288,22 +350,14 @@ def test_refuses_a_window_that_cannot_be(mini: System, sky: Sky, options, messag
 def test_refuses_another_instruments_interaction_matrix_and_too_few_frames(mini: System, sky: Sky) -> None:
     with pytest.raises(ValueError, match="G: expected shape"):
         Telemetry(mini, sky.interaction[:-1])
-    with pytest.raises(ValueError, match="at least 2 frames to count, got 0"):
+    with pytest.raises(NoWindow, match="at least 2 frames to count, got 0; so far: nothing came"):
         Telemetry(mini, sky.interaction).statistics()
 
 
 def test_frames_with_a_closed_sensor_are_left_out(sky: Sky, messages) -> None:
     """What it sent is no sky. A frame held because a sensor was late is good, as long as none was closed."""
     matcher = Matcher(sky.layout)
-    writer = DmCommandWriter("hrtc", sky.layout.n_commands)
     said = {k: (0, 0b1101) for k in range(100, 120)} | {110: (3, 0b0101), 130: (3, 0b1011), 140: (7, 0b1101)}
-    altered = []
-    for is_slopes, data in messages:
-        if not is_slopes and (answer := read_dm_command(data)).frame in said:
-            verdict, sensors = said[answer.frame]
-            writer.values[:] = answer.commands
-            data = writer.write(*answer._replace(verdict=verdict, sensors=sensors)[:-1])
-        altered.append((is_slopes, data))
-    frames = {matched.frame for matched in _matched(matcher, altered)}
+    frames = {matched.frame for matched in _matched(matcher, list(_with_closed(messages, said)))}
     assert matcher.tally.sensor_closed == 21
     assert set(range(90, 150)) - frames == {*range(100, 120), 140}

@@ -1,0 +1,147 @@
+"""The SRTC node beside a loop that is made up: why there is nothing new is said in health and diagnostics."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from srtomo_core import wire
+from srtomo_core.layout import Layout
+from srtomo_core.system import load_system
+from srtomo_core.wire import DmCommandWriter, SlopeFrameWriter
+
+pytest.importorskip("rclpy", reason="needs rclpy: pip install '.[ros]', or source ROS 2 Jazzy")
+
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from msgs_schema.msg import DmCommand, HrtcStatus, ModelHealth, SlopeFrame
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.qos import QoSProfile
+
+import srtomo_srtc.node
+from srtomo_srtc.learn import LearnError
+from srtomo_srtc.listener import Listener
+from srtomo_srtc.node import SrtcNode
+from srtomo_srtc.telemetry import NoWindow
+
+FAILED = 3
+
+
+class Loop:
+    """Random slopes, each frame answered flat; and what the SRTC beside it says."""
+
+    def __init__(self, srtc: SrtcNode) -> None:
+        self.srtc, self.node = srtc, Node("loop")
+        self._layout = layout = Layout(load_system("mini"))
+        self._sensors = [
+            SlopeFrameWriter(sensor.name, 7, layout.fingerprint, w, 1, sensor.n_valid)
+            for w, sensor in enumerate(layout.sensors)
+        ]
+        self._answers = DmCommandWriter("hrtc", layout.n_commands)
+        self._slopes, self._commands, self._status = (
+            self.node.create_publisher(kind, topic.name, QoSProfile(**topic.qos(2000)))
+            for kind, topic in ((SlopeFrame, wire.SLOPES), (DmCommand, wire.COMMAND), (HrtcStatus, wire.STATUS))
+        )
+        self._executor = SingleThreadedExecutor()
+        self._executor.add_node(srtc)
+        self._executor.add_node(self.node)
+        self.healths: list[ModelHealth] = []
+        self.diagnostics: list[tuple[int, str]] = []
+        self._subscribe(ModelHealth, wire.HEALTH, self.healths.append)
+        self._subscribe(
+            DiagnosticArray,
+            wire.DIAGNOSTICS,
+            lambda m: self.diagnostics.extend((int.from_bytes(s.level, "little"), s.message) for s in m.status),
+        )
+        self._frame, self._rng = 0, np.random.default_rng(1)
+
+    def _subscribe(self, kind: type, topic: wire.Topic, call: Callable[[Any], None]) -> None:
+        self.node.create_subscription(kind, topic.name, call, QoSProfile(**topic.qos()))
+
+    def run(self, seconds: float, sensors: int | None = 0b1111) -> None:
+        """Frames at 200 Hz, answered with some sensors; None: no frames."""
+        reconstructor = self.srtc._built["file"].reconstructor.id
+        self._status.publish(HrtcStatus(reconstructor=reconstructor))
+        for frame in range(self._frame, self._frame + (0 if sensors is None else round(200 * seconds))):
+            for writer in self._sensors:
+                writer.values[:] = 1e-6 * self._rng.standard_normal(len(writer.values))
+                self._slopes.publish(writer.write(frame, frame, -1, -1, 1.0))
+            fields = (7, frame, reconstructor, 1, sensors, 0, True, 0, 0.5, -1)
+            self._commands.publish(self._answers.write(0, frame, *fields, -1, -1, 1.0, 0.0))
+            self._frame = frame + 1
+        until = time.monotonic() + seconds
+        while time.monotonic() < until:
+            self._executor.spin_once(timeout_sec=0.01)
+
+    def until(self, told: str, sensors: int | None = 0b1111) -> tuple[ModelHealth, int]:
+        """Go on until health and diagnostics both tell a reason; the message, and the diagnostics' level."""
+        patience = time.monotonic() + 60
+        while time.monotonic() < patience:
+            self.run(0.2, sensors)
+            healths = [message for message in self.healths if told in message.text]
+            levels = [level for level, text in self.diagnostics if told in text]
+            if healths and levels:
+                return healths[-1], levels[-1]
+        raise AssertionError(f"no {told!r}: {[m.text for m in self.healths]}, {self.diagnostics[-3:]}")
+
+
+@pytest.fixture
+def loop(ros_domain: int, monkeypatch: pytest.MonkeyPatch) -> Iterator[Loop]:
+    def fails(*_: object, **__: object) -> None:
+        raise LearnError("of no sky at all")
+
+    monkeypatch.setattr(srtomo_srtc.node, "learned_sky", fails)
+    parameters = ("system:=mini", "learn:=true", "window:=1.0", "closures:=none")
+    rclpy.init(args=["--ros-args", *(word for parameter in parameters for word in ("-p", parameter))])
+    srtc = SrtcNode()
+    rig = Loop(srtc)
+    try:
+        srtc.build()
+        yield rig
+    finally:
+        srtc.close()
+        rig.node.destroy_node()
+        rclpy.shutdown()
+
+
+def test_a_window_is_given_once() -> None:
+    window: Any = SimpleNamespace(session=7, last_frame=10)
+    telemetry: Any = SimpleNamespace(
+        add_slopes=None, add_command=None, statistics=lambda: window, refusal=lambda what: NoWindow(what, 7, 20)
+    )
+    node: Any = SimpleNamespace(create_subscription=lambda *_, **__: None)
+    listener = Listener(node, telemetry, 200.0, 4)
+    assert listener._window() is window
+    assert str(listener._window()) == "no new frame to count"
+    window.last_frame = 11
+    assert listener._window() is window
+
+
+def test_whatever_becomes_of_a_window_is_said(loop: Loop, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A fit that fails, silence, a sensor that is closed, and the listener's end."""
+    health, level = loop.until("no candidate: of no sky at all")
+    assert (health.decision, level) == (FAILED, 1)
+    assert (health.source, health.n_blocks > 5, len(health.innovation)) == ("file", True, 4)
+
+    health, level = loop.until("nothing came", sensors=None)
+    assert (health.decision, health.session, health.source, level) == (FAILED, 7, "file", 1)
+    judged = [message.last_frame for message in loop.healths if "telemetry" not in message.text]
+    assert len(set(judged)) == len(judged)
+
+    health, level = loop.until("sensor closed", sensors=0b1101)
+    assert (health.decision, level) == (FAILED, 1)
+
+    def breaks(message: object) -> None:
+        raise MemoryError("no room")
+
+    assert loop.srtc._listener is not None
+    monkeypatch.setattr(loop.srtc._listener._telemetry._matcher, "add_slopes", breaks)
+    health, level = loop.until("telemetry has ended")
+    assert "MemoryError: no room" in health.text
+    assert (health.decision, level) == (FAILED, 2)
