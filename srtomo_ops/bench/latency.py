@@ -41,7 +41,12 @@ PATH_TARGETS = {"staggered": 0.5, "burst": 1.0}
 TOLERANCE = 1e-4
 """Of a command, of the largest of its frame: float32 leaves some 1e-6; a wrong slope or state leaves about 1."""
 
-_HELD = (Verdict.HOLD_BEHIND, Verdict.HOLD_INCOMPLETE, Verdict.HOLD_MISSING)  # what a loop that is behind may say
+HELD = (Verdict.HOLD_BEHIND, Verdict.HOLD_INCOMPLETE, Verdict.HOLD_MISSING)
+"""What a loop that is behind may say of a frame: its command costs no product, and is in no figure."""
+
+MOST_HELD = 0.01
+"""Share of held frames above which there are no figures: those left would be of the easier frames."""
+
 _SESSION = 1
 _DISTINCT = 8  # slope vectors; their negatives follow, so that commands stay where they are
 _SLOPE = 1e-7  # rad rms
@@ -136,7 +141,7 @@ class Reference:
         self.error = 0.0
 
     def check(self, commands: Iterable[DmCommand], frames: int) -> None:
-        """Hold the next ``frames`` commands against the law; ``error`` and ``held`` count on.
+        """Hold the next ``frames`` commands against the law; ``error``, ``held`` and ``frame`` count on.
 
         Raises:
             ValueError: one is missing, twice, out of order, not of the closed loop, or wrong.
@@ -162,7 +167,7 @@ class Reference:
             seen = (1 - self._part) * self._past[self._whole - 1] + self._part * self._past[self._whole]
             y = self._products[self.frame % len(self._products)]
             u = np.clip(self._keep * u + self._gain * (self._Q @ seen + y), -self._limit, self._limit)
-        elif command.verdict in _HELD:
+        elif command.verdict in HELD:
             self.held += 1
         else:
             raise ValueError(f"frame {self.frame} was answered with verdict {Verdict(command.verdict).name}")
@@ -249,7 +254,7 @@ class Compute:
         latencies: of ``sgemv`` (one product R y, numpy); ``staggered``, ``burst`` and ``burst_int16`` (last message due
             to command serialised); ``float32`` and ``int16`` (that kernel alone, over the whole of R).
         error: largest error of a command, of the largest of its frame.
-        held: frames that the loop held because it was behind.
+        held: frames that the loop held because it was behind; they are left out.
         int16_to_noise: see :func:`srtomo_rtc.compression.int16_to_noise`.
     """
 
@@ -278,11 +283,20 @@ def wait_until(due_ns: int, awake: bool = False) -> int:
     return now
 
 
+def refuse_if_held(what: str, held: int, frames: int) -> None:
+    """Raise ValueError if more than MOST_HELD of the frames were held."""
+    if held > MOST_HELD * frames:
+        raise ValueError(
+            f"{what}: {held} of {frames} frames were held because the loop was behind, more than {MOST_HELD:.0%}: "
+            "the figures would be those of the others"
+        )
+
+
 def measure_compute(problem: Problem, frames: int) -> Compute:
     """Latencies without ROS, ``frames`` of each kind, in turns of a few frames.
 
     Raises:
-        ValueError: a command is missing or wrong, or a kernel's product is.
+        ValueError: a command is missing or wrong, or a kernel's product is; too many frames were held.
     """
     period = round(1e9 / problem.system.loop.rate)
     loop, loop_int16 = LoopHere(problem, period), LoopHere(problem, period, "int16")
@@ -298,11 +312,13 @@ def measure_compute(problem: Problem, frames: int) -> Compute:
         for name, run in measured.items():
             samples[name] += run(block)
         left -= block
+    held = loop.reference.held + loop_int16.reference.held
+    refuse_if_held("compute", held, loop.reference.frame + loop_int16.reference.frame)
     latencies = {name: Summary.of(values) for name, values in samples.items()}
     return Compute(
         latencies,
         max(loop.reference.error, loop_int16.reference.error),
-        loop.reference.held + loop_int16.reference.held,
+        held,
         int16_to_noise(problem.system, problem.layout, problem.reconstructor.R[0]),
     )
 
@@ -329,7 +345,7 @@ class LoopHere:
         self._commands.append(buffer)
 
     def run(self, arrival: str, frames: int) -> list[int]:
-        """Latencies of the next frames, ns, once they are checked."""
+        """Latencies of the next frames but for those held, ns, once they are checked."""
         sensors, hrtc = self._sensors[arrival], self._hrtc
         latencies = []
         first = self.reference.frame
@@ -342,9 +358,10 @@ class LoopHere:
                 hrtc.advance()
             latencies.append(self._ready - last)
             hrtc.idle(self._ready)
-        commands, self._commands = self._commands, []
-        self.reference.check(map(read_dm_command, commands), frames)
-        return latencies
+        commands = [read_dm_command(buffer) for buffer in self._commands]
+        self._commands = []
+        self.reference.check(commands, frames)
+        return [ns for ns, command in zip(latencies, commands, strict=True) if command.verdict not in HELD]
 
 
 def _kernels(problem: Problem, period: int) -> dict[str, Callable[[int], list[int]]]:

@@ -55,7 +55,7 @@ def report(problem: Problem, compute: Compute, paths: Paths | None) -> tuple[lis
     lines.append("targets, set for gnao_ltao_sr, in units of (a)")
     lines += [line for line, _ in targets]
     if held := compute.held + (paths.held if paths else 0):
-        lines.append(f"{held} frames were held because the loop was behind; they are in the figures")
+        lines.append(f"{held} frames were held because the loop was behind; they are left out of the figures")
     if paths is not None:
         lines += [f"{name}: its queue lost slopes of {n} frames" for name, n in paths.lost.items() if n]
     return lines, all(met for _, met in targets)

@@ -24,7 +24,7 @@ from scipy import stats
 
 from srtomo_core import wire
 from srtomo_core.reconstructor import save_interaction_matrix
-from srtomo_ops.bench.latency import ARRIVALS, Problem, Sensors, Summary, wait_until
+from srtomo_ops.bench.latency import ARRIVALS, HELD, Problem, Sensors, Summary, refuse_if_held, wait_until
 from srtomo_ops.operator import Operator
 from srtomo_ops.processes import Processes
 from srtomo_rtc import realtime
@@ -48,6 +48,7 @@ class Turn(NamedTuple):
         answered: when the node published the command.
         returned: when the middleware received it here.
         taken: s, DmCommand.latency: the loop's own, last slopes received to command ready.
+        held: the node was behind, and multiplied nothing; left out of all that follows.
     """
 
     sent: Times
@@ -55,6 +56,7 @@ class Turn(NamedTuple):
     answered: Times
     returned: Times
     taken: NDArray[np.float64]
+    held: NDArray[np.bool_]
 
     @property
     def path(self) -> Times:
@@ -64,7 +66,7 @@ class Turn(NamedTuple):
     @property
     def inside(self) -> Times:
         """Last slopes received by the node's middleware to command published; ns, without warm-up and lost slopes."""
-        return (self.answered - self.received)[self._counted][self.received[self._counted] > 0]
+        return (self.answered - self.received)[self._counted & (self.received > 0)]
 
     @property
     def loop(self) -> NDArray[np.float64]:
@@ -72,8 +74,8 @@ class Turn(NamedTuple):
         return self.taken[self._counted] * 1e9
 
     @property
-    def _counted(self) -> slice:
-        return slice(min(WARM_UP, len(self.sent) // 5), None)
+    def _counted(self) -> NDArray[np.bool_]:
+        return ~self.held & (np.arange(len(self.sent)) >= min(WARM_UP, len(self.sent) // 5))
 
 
 class Difference(NamedTuple):
@@ -103,8 +105,8 @@ class PathLatency(NamedTuple):
 class Paths(NamedTuple):
     """All that was measured, by way of arrival.
 
-    ``error`` and ``held`` are as in :class:`~srtomo_ops.bench.latency.Compute`; ``realtime`` is what the HRTC says of
-    its settings; ``lost`` counts the frames of each node of which its queue lost slopes.
+    ``error`` and ``held`` are as in :class:`~srtomo_ops.bench.latency.Compute`, ``held`` of both nodes; ``realtime`` is
+    what the HRTC says of its settings; ``lost`` counts the frames of each node of which its queue lost slopes.
     """
 
     arrivals: dict[str, PathLatency]
@@ -196,7 +198,7 @@ def measure_paths(
 
     Raises:
         ValueError: a node ended, refused or did not answer; a frame has not exactly one command, in order; or the
-            HRTC's are wrong.
+            HRTC's are wrong; too many frames were held.
     """
     save_interaction_matrix(folder / "gcal.npz", problem.G, problem.layout.fingerprint, {"source": "bench"})
     problem.reconstructor.save(folder / "reconstructor.npz")
@@ -248,7 +250,10 @@ def measure_paths(
         rclpy.shutdown()
     received = {node: _received(folder / f"{node}.npy", end.messages) for node, end in ends.items()}
     lost = {node: int(np.sum(times == 0)) for node, times in received.items()}
-    return Paths(log.summarise(received), reference.error, reference.held, lost, settings)
+    held = log.held()
+    for node, end in ends.items():
+        refuse_if_held(f"path, {node}", held[node], end.frame)
+    return Paths(log.summarise(received), reference.error, sum(held.values()), lost, settings)
 
 
 def _listen_at(priority: int) -> None:
@@ -294,7 +299,15 @@ class _Log:
             np.array([info["source_timestamp"] for _, info in back], np.int64),
             np.array([info["received_timestamp"] for _, info in back], np.int64),
             np.array([command.latency for command in commands], np.float64),
+            np.array([command.verdict in HELD for command in commands]),
         )))  # fmt: skip
+
+    def held(self) -> dict[str, int]:
+        """Frames that each node held."""
+        found: dict[str, int] = {}
+        for node, _, turn in self._turns:
+            found[node] = found.get(node, 0) + int(turn.held.sum())
+        return found
 
     def summarise(self, received: dict[str, Times]) -> dict[str, PathLatency]:
         """With the times that the nodes noted, of all their frames."""

@@ -128,10 +128,34 @@ def test_no_figure_without_the_check(monkeypatch: pytest.MonkeyPatch, capsys: py
     assert streams.out == ""
 
 
+def test_held_frames_are_in_no_figure(
+    mini: Problem, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    messages = latency.Sensors.messages
+
+    def cut(sensors: latency.Sensors, frame: int) -> list[bytes]:
+        """The last packet of a staggered frame 3 is the first again."""
+        made = messages(sensors, frame)
+        return [*made[:-1], made[0]] if frame == 3 else made
+
+    monkeypatch.setattr(latency.Sensors, "messages", cut)
+    loop = latency.LoopHere(mini, 1_000_000)
+    latencies = loop.run("staggered", 20)
+    assert (loop.reference.held, len(latencies)) == (1, 19) and min(latencies) > 0
+    assert main(["bench", "latency", "mini", "--compute-only", "--frames", "10", "--pairs", "2"]) == 2
+    streams = capsys.readouterr()
+    assert "compute: 1 of 60 frames were held because the loop was behind, more than 1%" in streams.err
+    assert streams.out == ""
+
+
 def test_the_whole_path(start_process, tmp_path: Path) -> None:
     words = ("bench", "latency", "mini", "--frames", "20", "--pairs", "2", "--json", tmp_path / "a.json")
-    process = start_process("-m", "srtomo_ops.cli", *words)
-    assert process.wait(60) in (0, 1), process.output
+    for _ in range(5):
+        process = start_process("-m", "srtomo_ops.cli", *words)
+        # on a crowded machine one frame may be held, of so few too many
+        if process.wait(60) != 2 or "frames were held" not in process.output:
+            break
+    assert process.wait() in (0, 1), process.output
     path = json.loads((tmp_path / "a.json").read_text())["path"]
     assert path["largest_error"] < latency.TOLERANCE
     for arrival in PATH_TARGETS:

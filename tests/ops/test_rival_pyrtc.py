@@ -4,7 +4,7 @@
 the instrument's rate, compute on one core with one BLAS thread, and are held against float64 in every frame. The clock
 starts when the slopes, or the last message of them, are due. Theirs ends when the command is in its shared memory, and
 leaves out what writing the slopes there takes; ours ends when the command is serialised, and holds the reading of the
-messages, the gate and its checks. Of their integrators the faster one counts.
+messages, the gate and its checks. Of their integrators the faster one counts, of medians and of tails.
 """
 
 from __future__ import annotations
@@ -123,6 +123,8 @@ def test_we_are_faster(rival: Rival, problem: Problem, capsys: pytest.CaptureFix
     found = {name: Summary.of(latencies) for name, latencies in taken.items()}
     tail = {name: float(np.quantile(latencies, 0.999)) * 1e-9 for name, latencies in taken.items()}
     best = min(INTEGRATORS, key=lambda name: found[name].median)
+    best_tail = min(tail[name] for name in INTEGRATORS)
+    assert ours.reference.held == 0
     with capsys.disabled():
         print(f"\n{'us':<28}{'median':>8}{'p90':>8}{'p99':>8}{'p99.9':>8}{'max':>9}")
         for name, s in found.items():
@@ -133,4 +135,4 @@ def test_we_are_faster(rival: Rival, problem: Problem, capsys: pytest.CaptureFix
             print(f"{arrival}: {ratio:.1f} times as fast as {best} in the median, wanted {FASTER[arrival]:g}")
     for arrival in ARRIVALS:
         assert found[arrival].median * FASTER[arrival] <= found[best].median
-        assert tail[arrival] < tail[best]
+        assert tail[arrival] < best_tail
