@@ -93,7 +93,13 @@ def _statistics(reader: BagReader, system: System, layout: Layout, matrix: Path 
     # one block, longer than the bag: nothing is forgotten or held out
     telemetry = Telemetry(system, G, layout=layout, window=(last - first) * 1e-9 + 1, blocks=1, held_out=0)
     telemetry.feed(reader)
-    return telemetry.statistics()
+    statistics = telemetry.statistics()
+    if telemetry.tally.sessions > 1:
+        print(
+            f"{telemetry.tally.sessions} sessions in the bag: of the last one alone, frames {statistics.first_frame} "
+            f"to {statistics.last_frame}"
+        )
+    return statistics
 
 
 def _print(system: System, statistics: Statistics, learned: Learned) -> None:

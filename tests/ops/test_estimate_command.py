@@ -5,9 +5,26 @@ from pathlib import Path
 
 import pytest
 
+from srtomo_core import wire
+from srtomo_core.bag import BagReader, BagWriter
 from srtomo_ops.cli import main
 
 BAG = Path(__file__).parents[2] / "bags" / "mini"
+SESSION = (0x6D696E69).to_bytes(8, "little")
+
+
+def with_another_session(path: Path, messages: int) -> Path:
+    """The bag, and after it the first slopes and commands once more as of another session."""
+    with BagReader(BAG) as reader, BagWriter(path, reader.metadata) as writer:
+        writer.declare_as(reader)
+        hot = [reader.topic(topic.name) for topic in (wire.SLOPES, wire.COMMAND)]
+        again = [message for message in reader if message.topic in hot][:messages]
+        for message in reader:
+            writer.write(message.topic, message.type, message.data, message.log_time, message.log_time)
+        for message in again:
+            data = message.data.replace(SESSION, bytes(7) + b"\x01", 1)
+            writer.write(message.topic, message.type, data, message.log_time + 10**10, message.log_time + 10**10)
+    return path
 
 
 def test_a_bag_s_sky(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -23,6 +40,15 @@ def test_a_bag_s_sky(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     out = capsys.readouterr().out
     assert f"{100 * sky['r0_m']:.2f} +- {100 * sky['r0_sigma_m']:.2f} cm" in out
     assert plot.read_bytes()[:4] == b"\x89PNG"
+
+
+def test_of_two_sessions_it_says_which(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    whole, few = with_another_session(tmp_path / "whole", 10**6), with_another_session(tmp_path / "few", 5)
+    assert main(["estimate", str(whole), "--altitudes", "0,10000"]) == 0
+    assert "2 sessions in the bag: of the last one alone, frames 0 to 148\n" in capsys.readouterr().out
+    assert main(["estimate", str(few), "--altitudes", "0,10000"]) == 2
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert "at least 2 frames to count, got 1 in the last of 2 sessions; since frame 0: nothing came" in line
 
 
 @pytest.mark.parametrize(
