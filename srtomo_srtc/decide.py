@@ -10,7 +10,8 @@ says whether the difference is worth anything. What each number stops:
 - too few frames, or too alike: errors by jackknife over blocks of frames, and the number of blocks;
 - a better model that would not change the commands much: the predicted gain;
 - a swap on data that no longer hold, or a matrix that is not what its model promises: the watch afterwards, by the same
-  numbers on new frames, and by what the loop leaves of the slopes.
+  numbers on new frames, and by what the loop leaves of the slopes; once that is passed, as long as there is a way back,
+  by the rule of every swap: both numbers.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ class Rules:
     Attributes:
         floor: m rms, by which the wavefront error has to fall.
         every: s, from one swap to the next at least.
-        watch: s, how long a new reconstructor is watched.
+        watch: s, how long a new reconstructor is watched closely.
         pause: s, from a roll-back to the next swap.
         errors: standard errors by which held-out frames have to prefer a model.
         tolerance: how far the innovation of a sensor that others foretell may be from 1, as a factor less 1.
@@ -130,7 +131,7 @@ class Decision:
 class Decider:
     """One loop's decisions: idle until a candidate is better, then watching it, and after a roll-back paused.
 
-    A swap that is being watched may be followed by the next.
+    A swap that is being watched may be followed by the next. Not for several threads at once.
 
     Args:
         sensors: their names.
@@ -222,7 +223,10 @@ class Decider:
         self._state, self._since, self._left_before = State.WATCHING, self._clock(), left
 
     def watch(self, comparison: Comparison, explained: Array, left: Estimate) -> Decision:
-        """Judge the reconstructor that was committed last by frames since; the watch ends when its time is over.
+        """Judge the reconstructor that was committed last by frames since.
+
+        While it is watched one number that speaks for the one before is enough; later both have to. The pause begins
+        with the decision.
 
         Args:
             comparison: of the new model, as the candidate, with the one before.
@@ -231,11 +235,13 @@ class Decider:
                 the light that has changed, and this share with it: then it says nothing of the reconstructor.
         """
         rules = self.rules
-        for name, difference in comparison.differences:
-            if difference.significance <= -rules.errors:
-                return self._roll_back(f"by its {name} the one before is better: {comparison.text}")
-        worse = left.mean - rules.errors * left.error > rules.left * self._left_before
-        if worse and not self.ill(comparison.candidate, explained):
+        worse = [name for name, difference in comparison.differences if difference.significance <= -rules.errors]
+        if self.state is not State.WATCHING and len(worse) < len(comparison.differences):
+            return Decision(Action.KEEP, f"no worse than the one before: {comparison.text}")
+        if worse:
+            return self._roll_back(f"by its {' and '.join(worse)} the one before is better: {comparison.text}")
+        grown = left.mean - rules.errors * left.error > rules.left * self._left_before
+        if grown and not self.ill(comparison.candidate, explained):
             return self._roll_back(
                 f"the loop leaves {100 * float(left.mean):.1f} % of the slopes' power, "
                 f"{100 * self._left_before:.1f} % before the swap"
@@ -255,4 +261,5 @@ class Decider:
             self._state = State.IDLE
 
     def _roll_back(self, reason: str) -> Decision:
+        self._state, self._since = State.PAUSED, self._clock()
         return Decision(Action.ROLL_BACK, f"roll back: {reason}")

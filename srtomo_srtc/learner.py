@@ -2,12 +2,14 @@
 
 Every window is fitted; what the fit believes is compared with what the loop runs on, on frames that the fit has not
 seen; and what is better by :mod:`srtomo_srtc.decide`'s rules becomes a reconstructor. Whoever calls this publishes and
-commits it, and says what the loop runs (:meth:`Learner.running`). A swap that it asked for is watched, and taken back.
+commits it, and says what the loop runs (:meth:`Learner.running`). What runs is judged by the latest frames apart from
+that, without a fit; a swap that was asked for is watched so, and taken back, for as long as there is a way back.
 """
 
 from __future__ import annotations
 
 import enum
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -24,7 +26,7 @@ from srtomo_srtc.health import FEWEST_BLOCKS, Estimate, FlowModel, Health, Slope
 from srtomo_srtc.learn import Learned, learn
 from srtomo_srtc.learn_wind import LayerWind, learn_winds, with_winds
 from srtomo_srtc.predict import Prediction, mean_wfe
-from srtomo_srtc.telemetry import HeldOut, Statistics
+from srtomo_srtc.telemetry import HeldOut, Recent, Statistics
 from srtomo_srtc.wind import with_trusted_winds
 
 
@@ -42,12 +44,14 @@ class Belief:
     reconstructor: Reconstructor
     layout: Layout | None = None
     models: dict[int, SlopeModel] = field(default_factory=dict)
+    _making: threading.Lock = field(default_factory=threading.Lock, repr=False)
 
     def model(self, ahead: int) -> SlopeModel:
-        """What the system supposes of the slopes; with ``ahead``, also of how many exposures later."""
-        if ahead not in self.models:
-            self.models[ahead] = model_of(self.system, ahead, self.layout)
-        return self.models[ahead]
+        """What the system supposes of the slopes; with ``ahead``, also of how many exposures later. Any thread."""
+        with self._making:
+            if ahead not in self.models:
+                self.models[ahead] = model_of(self.system, ahead, self.layout)
+            return self.models[ahead]
 
 
 def model_of(system: System, ahead: int, layout: Layout | None = None) -> SlopeModel:
@@ -111,7 +115,7 @@ class Outcome(enum.IntEnum):
 
 @dataclass(eq=False)
 class Judgement:
-    """What became of a window, and why.
+    """What became of a window, or of the latest frames, and why.
 
     Attributes:
         window: the telemetry that was judged.
@@ -128,7 +132,7 @@ class Judgement:
         seconds: that the stages took.
     """
 
-    window: Statistics
+    window: Statistics | Recent
     active: Belief | None = None
     previous: Belief | None = None
     outcome: Outcome = Outcome.KEPT
@@ -173,6 +177,8 @@ def _timed(judgement: Judgement, stage: str) -> Iterator[None]:
     judgement.seconds[stage] = round(time.perf_counter() - since, 3)
 
 
+_DROPPED = "dropped: the loop was given another reconstructor meanwhile"
+
 Fit = Callable[[Statistics], LearnedSky]
 """The sky from a window; raises LearnError, or another ValueError."""
 
@@ -181,7 +187,7 @@ Build = Callable[[System], Reconstructor]
 
 
 class Learner:
-    """The learning of one loop. One thread calls everything.
+    """The learning of one loop. One thread calls :meth:`judge`, another may call :meth:`watch`, any the others.
 
     Args:
         system: the instrument as its file says.
@@ -213,72 +219,104 @@ class Learner:
         self._known: dict[int, Belief] = {}
         self._active: Belief | None = None
         self._previous: Belief | None = None
+        self._ours = False  # the active one was asked for here, and the one before is the way back
         self._offered = 0
         self._left = np.inf
+        # of all of the above; never held while something is computed
+        self._lock = threading.Lock()
 
     def know(self, belief: Belief) -> None:
         """A reconstructor that the loop may come to run."""
-        self._known[belief.reconstructor.id] = belief
+        with self._lock:
+            self._known[belief.reconstructor.id] = belief
 
     def running(self, identity: int) -> None:
         """The loop now runs the reconstructor of this id: after every commit and roll-back, whoever asked for it."""
-        if self._active is not None and identity == self._active.reconstructor.id:
-            return
-        before, self._active = self._active, self._known.get(identity)
-        watched = self.decider.state is State.WATCHING
-        if watched and self._previous is not None and identity == self._previous.reconstructor.id:
-            self.decider.rolled_back()
-        elif identity == self._offered and before is not None:
-            self.decider.committed(self._left)
-        else:
-            self.decider.left_alone()
-        self._previous = before
-        needed = {belief.reconstructor.id for belief in (self._active, before) if belief is not None}
-        self._known = {
-            known: belief for known, belief in self._known.items() if known in needed or belief.source != "learned"
-        }
+        with self._lock:
+            if self._active is not None and identity == self._active.reconstructor.id:
+                return
+            before, self._active = self._active, self._known.get(identity)
+            back = self._ours and self._previous is not None and identity == self._previous.reconstructor.id
+            self._ours = not back and identity == self._offered and before is not None
+            if back:
+                self.decider.rolled_back()
+            elif self._ours:
+                self.decider.committed(self._left)
+            else:
+                self.decider.left_alone()
+            self._previous = before
+            needed = {belief.reconstructor.id for belief in (self._active, before) if belief is not None}
+            needed.add(self._offered)
+            self._known = {
+                known: belief for known, belief in self._known.items() if known in needed or belief.source != "learned"
+            }
+
+    def watch(self, recent: Recent) -> Judgement | None:
+        """Judge what the loop runs by the latest frames, and a swap that was asked for here by those since.
+
+        Two products a model and frame, once the models are there.
+
+        Returns:
+            with the health of the active model; ROLLED_BACK where the one before is better. None: there are too few
+            frames, or what is active is not known here or has just changed.
+        """
+        with self._lock:
+            active, previous = self._active, self._previous
+            watching = self._ours and self.decider.state is not State.PAUSED
+        held = recent.held_out
+        if active is None or len(np.unique(held.block)) < FEWEST_BLOCKS:
+            return None
+        judgement = Judgement(recent, active, previous)
+        model = active.model(self._ahead)
+        health = judgement.health = Health.of(model.scores(held.slopes), held.block)
+        ill = self.decider.ill(health, model.explained)
+        judgement.reason = f"the active model {f'does not explain {ill}' if ill else 'explains its sensors'}"
+        if not watching or previous is None:
+            return judgement
+        since = held.reconstructor == active.reconstructor.id
+        if len(np.unique(held.block[since])) < FEWEST_BLOCKS:
+            return judgement.ended(Outcome.KEPT, f"watching: too few frames since the swap; {judgement.reason}")
+        try:
+            judgement.watched = self._compared(model, previous.model(self._ahead), held, since)
+        except ValueError as error:  # of frames in pairs there may be fewer
+            return judgement.ended(Outcome.KEPT, f"watching: {error}; {judgement.reason}")
+        left = left_by_loop(held, since)
+        with self._lock:
+            if self._active is not active:
+                return None
+            decision = self.decider.watch(judgement.watched, model.explained, left)
+        back = decision.action is Action.ROLL_BACK
+        return judgement.ended(Outcome.ROLLED_BACK if back else Outcome.KEPT, decision.reason)
 
     def judge(self, window: Statistics) -> Judgement:
         """Fit a window and decide. Takes seconds to minutes, and as much memory as a few covariances of slopes."""
-        judgement = Judgement(window, self._active, self._previous)
-        if self._active is None:
+        with self._lock:
+            active = self._active
+            judgement = Judgement(window, active, self._previous)
+        if active is None:
             return judgement.ended(Outcome.FAILED, "the loop runs no reconstructor whose model is known here")
         held = window.held_out
         if (blocks := len(np.unique(held.block))) < FEWEST_BLOCKS:
             reason = f"{blocks} blocks of held-out frames in the window, {FEWEST_BLOCKS} are needed"
             return judgement.ended(Outcome.FAILED, reason)
-        model = self._active.model(self._ahead)
+        model = active.model(self._ahead)
         judgement.health = Health.of(model.scores(held.slopes), held.block)
-        watched = ""
-        if self.decider.state is State.WATCHING:
-            if self._watch(judgement):
-                return judgement
-            watched = judgement.reason
         if silent := model.silent(held.measured, held.block):
             names = ", ".join(self._sensors[w] for w in silent)
             return judgement.ended(Outcome.FAILED, f"no candidate: the slopes of {names} stand still")
-        self._consider(judgement)
-        if watched:
-            judgement.reason = f"{watched}; {judgement.reason}"
-        return judgement
+        return self._consider(judgement, window)
 
-    def _watch(self, judgement: Judgement) -> bool:
-        """Judge the last swap by the frames since; whether it is to be taken back."""
-        held, active, previous = judgement.window.held_out, self._active, self._previous
-        assert active is not None and previous is not None
-        since = held.reconstructor == active.reconstructor.id
-        if len(np.unique(held.block[since])) < FEWEST_BLOCKS:
-            judgement.reason = "watching: too few frames since the swap"
-            return False
-        model = active.model(self._ahead)
-        try:
-            judgement.watched = self._compared(model, previous.model(self._ahead), held, since)
-        except ValueError as error:  # of frames in pairs there may be fewer
-            judgement.reason = f"watching: {error}"
-            return False
-        decision = self.decider.watch(judgement.watched, model.explained, left_by_loop(held, since))
-        judgement.ended(Outcome.ROLLED_BACK if decision.action is Action.ROLL_BACK else Outcome.KEPT, decision.reason)
-        return decision.action is Action.ROLL_BACK
+    def _follow(self, judgement: Judgement, held: HeldOut) -> bool:
+        """Take up what the loop has come to run during a fit, if that was asked for here; else the fit is void."""
+        with self._lock:
+            if self._active is judgement.active:
+                return True
+            if self._active is None or not self._ours or self._previous is not judgement.active:
+                return False
+            active = judgement.active = self._active
+            judgement.previous = self._previous
+        judgement.health = Health.of(active.model(self._ahead).scores(held.slopes), held.block)
+        return True
 
     def _compared(
         self, candidate: SlopeModel, active: SlopeModel, held: HeldOut, some: NDArray[np.bool_] | None = None
@@ -294,16 +332,20 @@ class Learner:
         new, old = candidate.scores_ahead(*frames), active.scores_ahead(*frames)
         return compare(new, old, candidate.n_seen, held.block[later])
 
-    def _consider(self, judgement: Judgement) -> Judgement:
+    def _consider(self, judgement: Judgement, window: Statistics) -> Judgement:
         """Fit the window, compare, and build what is better."""
-        active, held = self._active, judgement.window.held_out
-        assert active is not None
+        held = window.held_out
         try:
             with _timed(judgement, "fit"):
-                judgement.sky = self._fit(judgement.window)
+                judgement.sky = self._fit(window)
                 system = judgement.sky.system
-            with _timed(judgement, "comparison"):
+            with _timed(judgement, "model"):
                 model = model_of(system, self._ahead, self._layout)
+            if not self._follow(judgement, held):
+                return judgement.ended(Outcome.KEPT, _DROPPED)
+            active = judgement.active
+            assert active is not None
+            with _timed(judgement, "comparison"):
                 comparison = judgement.comparison = self._compared(model, active.model(self._ahead), held)
         except (ValueError, np.linalg.LinAlgError) as error:
             return judgement.ended(Outcome.FAILED, f"no candidate: {error}")
@@ -318,13 +360,16 @@ class Learner:
             prediction = Prediction(system, self._layout, epochs=epochs)
             before, after = (mean_wfe(prediction.budgets(reconstructor.R)) for reconstructor in two)
         judgement.predicted = before, after
-        decision = self.decider.gains(preference, before, after)
-        if decision.action is not Action.COMMIT:
-            return judgement.ended(Outcome.KEPT, decision.reason)
-        judgement.candidate = candidate
-        self.know(candidate)
-        self._offered = candidate.reconstructor.id
         running = held.reconstructor == active.reconstructor.id
         enough = len(np.unique(held.block[running])) > 1
-        self._left = float(left_by_loop(held, running).mean) if enough else np.inf
+        left = float(left_by_loop(held, running).mean) if enough else np.inf
+        with self._lock:
+            if self._active is not active:
+                return judgement.ended(Outcome.KEPT, _DROPPED)
+            decision = self.decider.gains(preference, before, after)
+            if decision.action is not Action.COMMIT:
+                return judgement.ended(Outcome.KEPT, decision.reason)
+            judgement.candidate = candidate
+            self._offered, self._left = candidate.reconstructor.id, left
+            self._known[self._offered] = candidate
         return judgement.ended(Outcome.PUBLISHED, decision.reason)

@@ -12,7 +12,7 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
 from srtomo_core import wire
-from srtomo_srtc.telemetry import NoWindow, Statistics, Telemetry
+from srtomo_srtc.telemetry import NoWindow, Recent, Statistics, Telemetry
 
 _PERIOD = 0.01  # s between visits
 _BRIDGED = 5.0  # s of messages that wait while a window's statistics are put together, or others have the machine
@@ -30,6 +30,7 @@ class Listener(threading.Thread):
 
     Attributes:
         windows: what :meth:`ask` asked for; or why there is none.
+        recent: what :meth:`look` asked for.
         failure: what ended the thread before :meth:`finish`; empty while it goes on.
     """
 
@@ -45,14 +46,20 @@ class Listener(threading.Thread):
             subscription = node.create_subscription(kind, topic.name, lambda _: None, qos, raw=True)
             self._taps.append((subscription, kind, put, _ROUND * per_frame))
         self.windows: queue.SimpleQueue[Statistics | NoWindow] = queue.SimpleQueue()
+        self.recent: queue.SimpleQueue[Recent] = queue.SimpleQueue()
         self.failure = ""
         self._given = 0, -1  # session and last frame of the window that was given last
         self._asked = threading.Event()
+        self._looked = threading.Event()
         self._stopped = threading.Event()
 
     def ask(self) -> None:
         """Have the window as it stands put into :attr:`windows`."""
         self._asked.set()
+
+    def look(self) -> None:
+        """Have the latest held-out frames put into :attr:`recent`."""
+        self._looked.set()
 
     def finish(self) -> None:
         """End the thread."""
@@ -80,6 +87,9 @@ class Listener(threading.Thread):
             if self._telemetry.newest != answered:
                 answered, came = self._telemetry.newest, time.monotonic()
             self._telemetry.age(time.monotonic() - came)
+            if self._looked.is_set():
+                self._looked.clear()
+                self.recent.put(self._telemetry.recent())
             if self._asked.is_set():
                 self._asked.clear()
                 self.windows.put(self._window())

@@ -2,8 +2,9 @@
 
 It computes with one BLAS thread under SCHED_IDLE, so that the loop beside it is not disturbed. Reconstructors are
 published on request, by label or id; with ``learn`` also whenever one proves better on telemetry, and with
-``auto_commit`` they are committed and rolled back as well. Three threads: the executor's, which carries messages; the
-listener, which takes telemetry off the wire; the worker, which fits and builds.
+``auto_commit`` they are committed and rolled back as well. Four threads: the executor's, which carries messages; the
+listener, which takes telemetry off the wire; one that fits and builds; one that judges what the loop runs, which does
+not wait for a fit.
 """
 
 from __future__ import annotations
@@ -19,7 +20,6 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from types import FrameType
@@ -49,10 +49,11 @@ from srtomo_srtc.decide import Rules
 from srtomo_srtc.learner import Belief, Judgement, Learner, Outcome, lags_of, learned_sky
 from srtomo_srtc.listener import Listener
 from srtomo_srtc.model import ground_prior
+from srtomo_srtc.order import Order, Step
 from srtomo_srtc.reconstructors import implicit, predictive
 from srtomo_srtc.registration import registered_layout, with_places
 from srtomo_srtc.report import believed_fields, diagnosis, health_fields, learned_fields, refusal_fields
-from srtomo_srtc.telemetry import COUNTED_RATE, NoWindow, Statistics, Telemetry
+from srtomo_srtc.telemetry import BLOCKS, COUNTED_RATE, STRETCHES, NoWindow, Recent, Statistics, Telemetry
 from srtomo_srtc.wind import effective_lag
 from srtomo_srtc.worker import Worker
 
@@ -89,27 +90,6 @@ def parameters() -> Iterable[tuple[str, Any, str]]:
     return _PARAMETERS
 
 
-@dataclass
-class _Order:
-    """A swap that is to be made.
-
-    Attributes:
-        roll_back: to the HRTC's previous reconstructor; otherwise a commit of its staged one.
-        until: when it is given up, s of the monotonic clock.
-        called: the HRTC was asked.
-    """
-
-    reconstructor: Reconstructor
-    roll_back: bool
-    until: float
-    called: bool = False
-
-    @property
-    def text(self) -> str:
-        """What it is."""
-        return f"{'roll back to' if self.roll_back else 'commit'} {self.reconstructor.id:016x}"
-
-
 class SrtcNode(Node):
     """The node ``srtc``. Its methods run on the executor's thread."""
 
@@ -123,7 +103,7 @@ class SrtcNode(Node):
         self._healths = self._publisher(ModelHealth, wire.HEALTH)
         self._diagnostics = self._publisher(DiagnosticArray, wire.DIAGNOSTICS)
         self._built: dict[str, Belief] = {}
-        self._worker: Worker | None = None
+        self._learner: Learner | None = None
         self._listener: Listener | None = None
 
     def _publisher(self, kind: type, topic: wire.Topic) -> Any:
@@ -291,31 +271,54 @@ class SrtcNode(Node):
         self._system = system
         self._auto_commit, self._window = values["auto_commit"], values["window"]
         self._status: HrtcStatus | None = None
-        self._order: _Order | None = None
-        self._judging = False
-        self._last_asked = time.monotonic()
+        self._order: Order | None = None
+        self._judging = self._looking = False
+        self._last_asked = self._last_looked = time.monotonic()
+        self._last_seen = -1, -1
         self._reason = 0, "waiting for telemetry"
         self._hot_node = Node("srtc_hot")
         self._listener = Listener(self._hot_node, telemetry, system.loop.rate, len(system.sensors))
-        self._worker = Worker(learner)
-        self._listener.start()
-        self._worker.start()
+        self._learner = learner
+        self._fits: Worker[Statistics] = Worker("fits", learner.judge)
+        self._watch: Worker[Recent] = Worker("watch", learner.watch)
+        for thread in (self._listener, self._fits, self._watch):
+            thread.start()
         self.create_subscription(HrtcStatus, wire.STATUS.name, self._on_status, QoSProfile(**wire.STATUS.qos()))
         self._commit = self.create_client(SwapReconstructor, "hrtc/commit")
         self._roll_back = self.create_client(SwapReconstructor, "hrtc/roll_back")
         # timers of the system's clock would stop for as long as it is set back
         steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self.create_timer(0.1, partial(self._follow, self._listener, self._worker), clock=steady)
+        self.create_timer(0.1, partial(self._follow, self._listener), clock=steady)
+        self.create_timer(0.1, partial(self._look, self._listener), clock=steady)
         self.create_timer(1.0, partial(self._diagnose, self._listener), clock=steady)
 
     def _on_status(self, status: HrtcStatus) -> None:
-        if self._worker is not None and (self._status is None or status.reconstructor != self._status.reconstructor):
-            self._worker.running(status.reconstructor)
+        if self._learner is not None and (self._status is None or status.reconstructor != self._status.reconstructor):
+            self._learner.running(status.reconstructor)
         self._status = status
         self._pursue()
 
-    def _follow(self, listener: Listener, worker: Worker) -> None:
-        """Hand windows to the worker, and act on what it makes of them."""
+    def _look(self, listener: Listener) -> None:
+        """Have the latest frames judged each half block, and act on what comes of it."""
+        now = time.monotonic()
+        if not self._looking and now - self._last_looked >= self._window / (BLOCKS * STRETCHES):
+            self._last_looked, self._looking = now, True
+            listener.look()
+        if not listener.recent.empty():
+            recent = listener.recent.get()
+            seen, self._last_seen = self._last_seen, (recent.session, recent.last_frame)
+            if self._last_seen != seen:
+                self._watch.judge(recent)
+            else:
+                self._looking = False
+        if not self._watch.judgements.empty():
+            self._looking = False
+            judgement = self._watch.judgements.get()
+            if judgement is not None:
+                self._act_on(judgement)
+
+    def _follow(self, listener: Listener) -> None:
+        """Have windows judged, and act on what comes of it."""
         now = time.monotonic()
         if not (self._judging or listener.failure) and now - self._last_asked >= self._window:
             self._last_asked, self._judging = now, True
@@ -323,13 +326,15 @@ class SrtcNode(Node):
         if not listener.windows.empty():
             window = listener.windows.get()
             if isinstance(window, Statistics):
-                worker.judge(window)
+                self._fits.judge(window)
             else:
                 self._judging = False
                 self._refused(window)
-        if not worker.judgements.empty():
+        if not self._fits.judgements.empty():
             self._judging = False
-            self._act_on(worker.judgements.get())
+            judgement = self._fits.judgements.get()
+            if judgement is not None:
+                self._act_on(judgement)
 
     def _refused(self, why: NoWindow) -> None:
         """There is no window to judge."""
@@ -344,18 +349,25 @@ class SrtcNode(Node):
         self._healths.publish(message)
 
     def _act_on(self, judgement: Judgement) -> None:
+        active, status = judgement.active, self._status
+        if judgement.outcome in (Outcome.PUBLISHED, Outcome.ROLLED_BACK) and active is not None and status is not None:
+            if status.reconstructor != active.reconstructor.id:
+                judgement.candidate = None
+                judgement.ended(Outcome.KEPT, f"{judgement.reason}; dropped: the loop runs {status.reconstructor:016x}")
         candidate = judgement.candidate
-        if judgement.sky is not None:
+        if judgement.sky is not None and isinstance(judgement.window, Statistics):
             identity = candidate.reconstructor.id if candidate is not None else 0
             self._send_profile(_LEARNED, identity, learned_fields(self._system, judgement.sky, judgement.window))
         self._send_health(health_fields(judgement))
-        self._told(*diagnosis(judgement))
+        if isinstance(judgement.window, Statistics) or judgement.outcome is not Outcome.KEPT:
+            self._told(*diagnosis(judgement))
+        instead, until = active.reconstructor.id if active is not None else 0, time.monotonic() + _STAGING
         if judgement.outcome is Outcome.PUBLISHED and candidate is not None:
             self._built[_LEARNED] = candidate
             self._send(candidate.reconstructor)
-            self._give_order(_Order(candidate.reconstructor, False, time.monotonic() + _STAGING))
+            self._give_order(Order(candidate.reconstructor, False, instead, until))
         elif judgement.outcome is Outcome.ROLLED_BACK and judgement.previous is not None:
-            self._give_order(_Order(judgement.previous.reconstructor, True, time.monotonic() + _STAGING))
+            self._give_order(Order(judgement.previous.reconstructor, True, instead, until))
 
     def _told(self, level: int, reason: str) -> None:
         """Say it from now on in the diagnostics, and once in the log; ``level``: 0 OK, 1 WARN, 2 ERROR."""
@@ -367,7 +379,7 @@ class SrtcNode(Node):
         elif news:
             self.get_logger().info(reason)
 
-    def _give_order(self, order: _Order) -> None:
+    def _give_order(self, order: Order) -> None:
         if self._auto_commit:
             if self._order is not None:
                 self._told(2, f"could not {self._order.text}: the HRTC does not hold it")
@@ -380,19 +392,20 @@ class SrtcNode(Node):
         order, status = self._order, self._status
         if order is None or status is None or order.called:
             return
-        identity = order.reconstructor.id
-        if status.reconstructor == identity:
-            self._order = None
-        elif identity == (status.previous if order.roll_back else status.staged):
+        step = order.step(status.reconstructor, status.staged, status.previous, time.monotonic())
+        if step is Step.CALL:
             order.called = True
             client = self._roll_back if order.roll_back else self._commit
-            request = SwapReconstructor.Request(id=identity, sha256=list(order.reconstructor.sha256))
+            request = SwapReconstructor.Request(id=order.reconstructor.id, sha256=list(order.reconstructor.sha256))
             client.call_async(request).add_done_callback(partial(self._swapped, order))
-        elif time.monotonic() > order.until:
+        elif step is not Step.WAIT:
             self._order = None
-            self._told(2, f"could not {order.text}: the HRTC does not hold it")
+            if step is Step.DROP:
+                self._told(0, f"did not {order.text}: the loop was given {status.reconstructor:016x} meanwhile")
+            elif step is Step.FAIL:
+                self._told(2, f"could not {order.text}: the HRTC does not hold it")
 
-    def _swapped(self, order: _Order, future: Future) -> None:
+    def _swapped(self, order: Order, future: Future) -> None:
         self._order = None
         response = future.result()
         if response is not None and response.success:
@@ -410,8 +423,9 @@ class SrtcNode(Node):
 
     def close(self) -> None:
         """End the threads and give the endpoints back."""
-        if self._worker is not None and self._listener is not None:
-            self._worker.finish()
+        if self._learner is not None and self._listener is not None:
+            self._fits.finish()
+            self._watch.finish()
             self._listener.finish()
             self._hot_node.destroy_node()
         self.destroy_node()

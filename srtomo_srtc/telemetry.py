@@ -5,10 +5,10 @@
 y are the slopes as measured, m~ what was on the mirrors in that exposure, whatever the loop made of it: open, held,
 clipped or offset. P takes the blind modes of each sensor out.
 
-The window is a ring of blocks of equal time. Of every block the last part is held out, for models to be judged by
-frames that they were not fitted to. Blocks leave the window as frames are answered and time passes, whether new ones
-count or not. Every q-th exposure counts: successive frames say nearly the same of the turbulence, and noise is learned
-from few.
+The window is a ring of blocks of equal time, and a block a few stretches. Of every stretch the last part is held out,
+for models to be judged by frames that they were not fitted to: of a window by blocks, the latest ones by stretches.
+Blocks leave the window as frames are answered and time passes, whether new ones count or not. Every q-th exposure
+counts: successive frames say nearly the same of the turbulence, and noise is learned from few.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,6 +38,9 @@ WINDOW = 16.0
 
 BLOCKS = 8
 """Blocks of a window by default."""
+
+STRETCHES = 2
+"""Of a block. Of as many stretches as a window has blocks the latest held-out frames are: enough for a jackknife."""
 
 COUNTED_RATE = 125.0
 """Hz: frames that count, by default; of a slower loop every one."""
@@ -65,13 +69,14 @@ class NoWindow(ValueError):
 class HeldOut:
     """Whole frames that are in no moment, so that a model fitted to those can be judged.
 
-    Runs of successive counted frames, one run a block of the window; oldest first.
+    Runs of successive counted frames, one run a stretch; oldest first.
 
     Attributes:
         slopes: (n_held, n_slopes) pseudo-open-loop slopes without blind modes, P (y + G m~), rad.
         measured: (n_held, n_slopes) slopes as measured, without blind modes, P y, rad.
         frames: (n_held,) exposure numbers.
-        block: (n_held,) index of the run that each belongs to, ascending from 0: what a jackknife leaves out.
+        block: (n_held,) index, ascending from 0, of the part of the window that each belongs to: what a jackknife
+            leaves out.
         reconstructor: (n_held,) id of the reconstructor that answered the exposure; 0 when none was active, or the loop
             open.
     """
@@ -108,6 +113,21 @@ class Statistics:
     duration: float
     lagged: Mapping[int, NDArray[np.float32]]
     lagged_frames: Mapping[int, int]
+    held_out: HeldOut
+    session: int
+    first_frame: int
+    last_frame: int
+
+
+@dataclass(frozen=True, eq=False)
+class Recent:
+    """The latest held-out frames, for what cannot wait for a window; there may be none.
+
+    Attributes:
+        held_out: of the last half window; its blocks are stretches.
+        session, first_frame, last_frame: the exposures that they span; -1 without any.
+    """
+
     held_out: HeldOut
     session: int
     first_frame: int
@@ -157,6 +177,11 @@ def _mirrored(upper: Floats) -> Floats:
     return upper
 
 
+def _ranks(labels: NDArray[np.int64]) -> NDArray[np.intp]:
+    """Which of the different labels each is, from 0."""
+    return np.asarray(np.unique(labels, return_inverse=True)[1], np.intp)
+
+
 class Telemetry:
     """Accumulates :class:`Statistics` from SlopeFrames and DmCommands. One thread calls everything.
 
@@ -189,7 +214,7 @@ class Telemetry:
             blocks: that the window consists of.
             every: exposures from one counted frame to the next; by default what makes :data:`COUNTED_RATE`.
             lags: in exposures, at which lagged moments are formed.
-            held_out: share of every block that is held out, 0 for none.
+            held_out: share of every stretch that is held out, 0 for none.
 
         Raises:
             ValueError: G is of another instrument, or a block is too short for some counted frames.
@@ -202,15 +227,17 @@ class Telemetry:
             raise ValueError("blocks and lags: expected at least 1; held_out: expected 0 to less than 1")
         rate = system.loop.rate
         self.every = max(1, round(rate / COUNTED_RATE)) if every is None else every
-        self._block_length = round(window * rate / blocks / self.every)  # counted frames, held-out ones included
-        self._fit_length = self._block_length - round(held_out * self._block_length)
+        # counted frames, held-out ones included
+        self._stretch_length = round(window * rate / blocks / STRETCHES / self.every)
+        self._block_length = STRETCHES * self._stretch_length
+        self._fit_length = self._stretch_length - round(held_out * self._stretch_length)
         if self.every < 1 or self._fit_length < 2:
-            raise ValueError(f"window: {window:g} s in {blocks} blocks leaves fewer than 2 counted frames a block")
+            raise ValueError(f"window: {window:g} s in {blocks} blocks leaves fewer than 2 counted frames a half block")
         self._lags = tuple(sorted(set(lags)))
         n, m = G.shape
         require(
             4.0 * n * n * (blocks + 2) * (1 + len(self._lags))
-            + 16.0 * n * (self._block_length - self._fit_length) * (blocks + 1)
+            + 16.0 * n * (self._block_length - STRETCHES * self._fit_length) * (blocks + 1)
             + 4.0 * (4 * n + m) * _BATCH,
             f"telemetry of {system.name}",
         )
@@ -328,15 +355,28 @@ class Telemetry:
             last_frame=last,
         )
 
-    def _held_out(self) -> HeldOut:
-        runs = [block.held_out for block in self._blocks if block.held_out]
+    def recent(self) -> Recent:
+        """The held-out frames of the last half window as it stands; in time and memory next to nothing."""
+        self._flush()
+        held = self._held_out(self._stretch(self._matcher.newest) + 1 - self._n_blocks)
+        first, last = (int(held.frames[0]), int(held.frames[-1])) if len(held.frames) else (-1, -1)
+        return Recent(held, self._session, first, last)
+
+    def _held_out(self, since: int | None = None) -> HeldOut:
+        """Of the window, by its blocks; or of the stretches from one on, by these."""
         n = len(self._blind)
-        parts = [part for run in runs for part in run] or [
-            (np.empty((0, n), np.float32), np.empty((0, n), np.float32), np.empty(0, np.int64), np.empty(0, np.uint64))
-        ]
+        parts = [part for block in self._blocks for part in block.held_out]
+        if since is not None:
+            parts = [part for part in parts if self._stretch(part[2][-1]) >= since]
+        if not parts:
+            empty = np.empty((0, n), np.float32)
+            parts = [(empty, empty, np.empty(0, np.int64), np.empty(0, np.uint64))]
         slopes, measured, frames, reconstructor = (np.concatenate(column) for column in zip(*parts, strict=True))
-        lengths = [sum(len(part[2]) for part in run) for run in runs]
-        return HeldOut(slopes, measured, frames, np.repeat(np.arange(len(runs)), lengths), reconstructor)
+        stretch = self._stretch(frames)
+        if since is None:
+            return HeldOut(slopes, measured, frames, _ranks(stretch // STRETCHES), reconstructor)
+        some = stretch >= since
+        return HeldOut(slopes[some], measured[some], frames[some], _ranks(stretch[some]), reconstructor[some])
 
     # -- frames -----------------------------------------------------------------------------------------------------
 
@@ -344,10 +384,14 @@ class Telemetry:
         """Whether a frame counts, or is the earlier one of a pair."""
         return any((frame + lag) % self.every == 0 for lag in (0, *self._lags))
 
+    def _stretch(self, frame: Any) -> Any:
+        """The stretch that a frame is in, or frames are; every block begins with one."""
+        return frame // self.every // self._stretch_length
+
     def _place(self, frame: int) -> tuple[int, bool]:
         """The block that a frame is in, and whether it is held out there."""
-        block, place = divmod(frame // self.every, self._block_length)
-        return block, place >= self._fit_length
+        stretch, place = divmod(frame // self.every, self._stretch_length)
+        return stretch // STRETCHES, place >= self._fit_length
 
     def _take(self, final: bool = False) -> None:
         taken = self._matcher.take(final)

@@ -4,31 +4,31 @@ from __future__ import annotations
 
 import queue
 import threading
+from collections.abc import Callable
+from typing import Generic, TypeVar
 
-from srtomo_srtc.learner import Judgement, Learner, Outcome
-from srtomo_srtc.telemetry import Statistics
+from srtomo_srtc.learner import Judgement, Outcome
+from srtomo_srtc.telemetry import Recent, Statistics
+
+Telemetry = TypeVar("Telemetry", Statistics, Recent)
 
 
-class Worker(threading.Thread):
-    """Calls a :class:`Learner`, which is from then on this thread's alone.
+class Worker(threading.Thread, Generic[Telemetry]):
+    """Has telemetry judged by one method of a :class:`Learner`, which nobody else calls from then on.
 
     Attributes:
-        judgements: what came of the windows given.
+        judgements: what came of the telemetry given, each in its turn; None: nothing.
     """
 
-    def __init__(self, learner: Learner) -> None:
-        super().__init__(name="learner", daemon=True)
-        self._learner = learner
-        self._inbox: queue.SimpleQueue[Statistics | int | None] = queue.SimpleQueue()
-        self.judgements: queue.SimpleQueue[Judgement] = queue.SimpleQueue()
+    def __init__(self, name: str, method: Callable[[Telemetry], Judgement | None]) -> None:
+        super().__init__(name=name, daemon=True)
+        self._method: Callable[[Telemetry], Judgement | None] = method
+        self._inbox: queue.SimpleQueue[Telemetry | None] = queue.SimpleQueue()
+        self.judgements: queue.SimpleQueue[Judgement | None] = queue.SimpleQueue()
 
-    def judge(self, window: Statistics) -> None:
-        """Have a window judged. Any thread."""
-        self._inbox.put(window)
-
-    def running(self, identity: int) -> None:
-        """Tell what the loop runs. Any thread."""
-        self._inbox.put(identity)
+    def judge(self, telemetry: Telemetry) -> None:
+        """Have it judged. Any thread."""
+        self._inbox.put(telemetry)
 
     def finish(self) -> None:
         """End the thread when it is done with what it does; whoever ends the process need not wait for that."""
@@ -36,12 +36,9 @@ class Worker(threading.Thread):
 
     def run(self) -> None:
         """The thread's body."""
-        while (item := self._inbox.get()) is not None:
-            if isinstance(item, int):
-                self._learner.running(item)
-                continue
+        while (telemetry := self._inbox.get()) is not None:
             try:
-                judgement = self._learner.judge(item)
-            except Exception as error:  # whatever it is: this window gives no reconstructor, and the reason is told
-                judgement = Judgement(item).ended(Outcome.FAILED, f"{type(error).__name__}: {error}")
+                judgement = self._method(telemetry)
+            except Exception as error:  # whatever it is: nothing comes of this telemetry, and the reason is told
+                judgement = Judgement(telemetry).ended(Outcome.FAILED, f"{type(error).__name__}: {error}")
             self.judgements.put(judgement)

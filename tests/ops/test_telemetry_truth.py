@@ -167,18 +167,18 @@ def test_statistics_are_those_of_the_untouched_sky(mini: System, sky: Sky, messa
     untouched = Plant(mini, sky)
     truth = np.array([untouched.measure(k) for k in range(FRAMES)], float)
     truth -= (truth @ M) @ M.T
-    # 50 counted frames a block, the last ten of them held out; the end of the run waits behind no missing frame
-    fit = [k for k in range(0, FRAMES, 2) if k // 2 % 50 < 40 and k != BROKEN]
+    # 50 counted frames a block, the last five of each half held out; the end of the run waits behind no missing frame
+    fit = [k for k in range(0, FRAMES, 2) if k // 2 % 25 < 20 and k != BROKEN]
     rows = truth[fit]
     scale = np.abs(np.cov(rows.T)).max()
     assert statistics.n_frames == len(fit)
     assert statistics.mean == pytest.approx(rows.mean(axis=0), abs=1e-4 * np.sqrt(scale))
     assert statistics.covariance == pytest.approx(np.cov(rows.T, bias=True), abs=1e-5 * scale)
-    pairs = [k for k in fit if k >= 3 and (k - 3) // 2 % 50 < 40 and k - 3 != BROKEN]
+    pairs = [k for k in fit if k >= 3 and (k - 3) // 2 % 25 < 20 and k - 3 != BROKEN]
     lagged = truth[pairs].T @ truth[np.array(pairs) - 3] / len(pairs) - np.outer(rows.mean(axis=0), rows.mean(axis=0))
     assert statistics.lagged_frames == {3: len(pairs)}
     assert statistics.lagged[3] == pytest.approx(lagged, abs=1e-5 * scale)
-    held = [k for k in range(0, FRAMES, 2) if k // 2 % 50 >= 40]
+    held = [k for k in range(0, FRAMES, 2) if k // 2 % 25 >= 20]
     assert statistics.held_out.frames.tolist() == held
     assert statistics.held_out.slopes == pytest.approx(truth[held], abs=1e-4 * np.sqrt(scale))
     assert statistics.held_out.block.tolist() == np.repeat(range(4), 10).tolist()
@@ -186,6 +186,12 @@ def test_statistics_are_those_of_the_untouched_sky(mini: System, sky: Sky, messa
     assert statistics.held_out.frames[statistics.held_out.reconstructor > 0].tolist() == answered
     assert len(set(statistics.held_out.reconstructor)) == 3
     assert (statistics.first_frame, statistics.last_frame) == (fit[0], fit[-1])
+    # the latest ones: of as many stretches as there are blocks
+    recent = telemetry.recent()
+    assert recent.held_out.frames.tolist() == held[-20:]
+    assert recent.held_out.block.tolist() == np.repeat(range(4), 5).tolist()
+    assert (recent.held_out.slopes == statistics.held_out.slopes[-20:]).all()
+    assert (recent.session, recent.first_frame, recent.last_frame) == (statistics.session, held[-20], held[-1])
 
 
 def test_the_window_forgets(mini: System, sky: Sky, messages) -> None:
@@ -244,7 +250,7 @@ def test_it_needs_the_memory_that_it_asks_for(monkeypatch: pytest.MonkeyPatch) -
     ]
     answers = DmCommandWriter("hrtc", layout.n_commands)
     tracemalloc.start()
-    telemetry = Telemetry(system, G, window=0.2, blocks=8, every=1, lags=(2,))
+    telemetry = Telemetry(system, G, window=0.2, blocks=4, every=1, lags=(2,))
     for k in range(45):
         for writer in writers:
             telemetry.add_slopes(writer.write(k, k, -1, -1, 1.0))

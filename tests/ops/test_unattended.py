@@ -224,7 +224,7 @@ def test_it_builds_for_registered_places(start_process: Any, tmp_path: Path) -> 
         (["method:=magic"], "parameter method: expected one of implicit, predictive, got 'magic'"),
         (["learn:=true", "interaction_matrix:=nowhere.npz"], "parameter interaction_matrix: nowhere.npz: No such file"),
         (["registration:=nowhere.json"], "parameter registration: nowhere.json: No such file"),
-        (["learn:=true", "window:=0.1"], "window: 0.1 s in 8 blocks leaves fewer than 2 counted frames a block"),
+        (["learn:=true", "window:=0.1"], "window: 0.1 s in 8 blocks leaves fewer than 2 counted frames a half block"),
     ],
 )
 def test_wrong_parameters_are_refused_in_one_line(start_process: Any, parameters: list[str], why: str) -> None:

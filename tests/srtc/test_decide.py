@@ -249,6 +249,11 @@ def test_the_watch_ends_well(judge: Decider, clock: Clock) -> None:
     clock.now += 20
     assert "the swap was right" in judge.watch(made_up(1, -2), EXPLAINED, estimate(0.1, 0.01)).reason
     assert judge.state is State.IDLE
+    # from now on the way back takes what every swap takes
+    for comparison in (made_up(-4, 1), made_up(1, -4)):
+        assert judge.watch(comparison, EXPLAINED, estimate(0.9, 0.01)).action is Action.KEEP
+    assert judge.watch(made_up(-4, -4), EXPLAINED, estimate(0.1, 0.01)).action is Action.ROLL_BACK
+    assert judge.state is State.PAUSED
 
 
 @pytest.mark.parametrize(

@@ -119,15 +119,17 @@ def test_the_worker_outlives_whatever_a_fit_does(mini: System, window: Statistic
     learner = Learner(mini, fails, lambda system: implicit(system)[0])
     belief = Belief("file", mini, implicit(mini)[0])
     learner.know(belief)
-    worker = Worker(learner)
+    worker: Worker[Statistics] = Worker("fits", learner.judge)
     worker.start()
     worker.judge(window)
-    worker.running(belief.reconstructor.id)
+    first = worker.judgements.get(timeout=30)
+    learner.running(belief.reconstructor.id)
     worker.judge(window)
-    first, second = (worker.judgements.get(timeout=30) for _ in range(2))
+    second = worker.judgements.get(timeout=30)
     worker.finish()
     worker.join(timeout=30)
     assert not worker.is_alive()
+    assert first is not None and second is not None
     assert first.outcome is second.outcome is Outcome.FAILED
     assert "no reconstructor whose model is known" in first.reason
     assert "MemoryError: needs 80 GiB" in second.reason

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Callable, Iterator
 from types import SimpleNamespace
@@ -26,11 +27,12 @@ from rclpy.qos import QoSProfile
 
 import srtomo_srtc.node
 from srtomo_srtc.learn import LearnError
+from srtomo_srtc.learner import Judgement, Outcome
 from srtomo_srtc.listener import Listener
 from srtomo_srtc.node import SrtcNode
 from srtomo_srtc.telemetry import NoWindow
 
-FAILED = 3
+KEPT, FAILED = 0, 3
 
 
 class Loop:
@@ -145,3 +147,39 @@ def test_whatever_becomes_of_a_window_is_said(loop: Loop, monkeypatch: pytest.Mo
     health, level = loop.until("telemetry has ended")
     assert "MemoryError: no room" in health.text
     assert (health.decision, level) == (FAILED, 2)
+
+
+def test_health_is_live_while_a_fit_goes_on(loop: Loop, monkeypatch: pytest.MonkeyPatch) -> None:
+    """And what came of the fit is dropped when the loop runs something else by then."""
+    begun, over = threading.Event(), threading.Event()
+    windows = []
+
+    def fit(window: Any) -> Any:
+        windows.append(window)
+        begun.set()
+        over.wait(60)
+        raise LearnError("of no sky at all")
+
+    srtc = loop.srtc
+    assert srtc._learner is not None
+    monkeypatch.setattr(srtc._learner, "_fit", fit)
+    patience = time.monotonic() + 60
+    seen = None
+    while seen is None or loop.healths[-1].last_frame <= seen:
+        assert time.monotonic() < patience, [message.text for message in loop.healths]
+        loop.run(0.2)
+        if begun.is_set() and seen is None and loop.healths:
+            seen = loop.healths[-1].last_frame
+    message = loop.healths[-1]
+    assert (message.decision, message.source, message.n_blocks > 5, len(message.innovation)) == (KEPT, "file", True, 4)
+    assert "the active model" in message.text
+
+    file = srtc._built["file"]
+    srtc._auto_commit = True
+    for running, dropped in ((file.reconstructor.id, False), (5, True)):
+        srtc._status = HrtcStatus(reconstructor=running)
+        srtc._order = None
+        srtc._act_on(Judgement(windows[0], file, candidate=file).ended(Outcome.PUBLISHED, "better"))
+        assert (srtc._order is None) == dropped
+    assert srtc._reason == (0, "better; dropped: the loop runs 0000000000000005")
+    over.set()
