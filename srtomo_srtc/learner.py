@@ -245,6 +245,8 @@ class Learner:
             else:
                 self.decider.left_alone()
             self._previous = before
+            if self._active is None:
+                return  # the HRTC may have nothing yet, and come to what is known here
             needed = {belief.reconstructor.id for belief in (self._active, before) if belief is not None}
             needed.add(self._offered)
             self._known = {

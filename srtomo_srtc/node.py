@@ -50,6 +50,7 @@ from srtomo_srtc.learner import Belief, Judgement, Learner, Outcome, lags_of, le
 from srtomo_srtc.listener import Listener
 from srtomo_srtc.model import ground_prior
 from srtomo_srtc.order import Order, Step
+from srtomo_srtc.provenance import believed_system
 from srtomo_srtc.reconstructors import implicit, predictive
 from srtomo_srtc.registration import registered_layout, with_places
 from srtomo_srtc.report import believed_fields, diagnosis, health_fields, learned_fields, refusal_fields
@@ -77,6 +78,7 @@ _PARAMETERS: tuple[tuple[str, Any, str], ...] = (
     ("closures", "singles", f"what is built for when lasers are closed: {', '.join(get_args(Closures))}"),
     ("learn", False, "learn the sky from telemetry, and publish reconstructors that are better by it"),
     ("auto_commit", False, "commit what was learned, and roll back what proves worse; false: leave that to operators"),
+    ("keep", "", "path of the HRTC's parameter keep: what the loop runs is known from it after a restart of this node"),
     ("window", 16.0, "telemetry that a sky is learned from, s; each window is judged once"),
     ("every", 10.0, "from one swap to the next at least, s"),
     ("floor", 1.0, "wavefront error that a swap has to gain by prediction, nm rms"),
@@ -151,6 +153,8 @@ class SrtcNode(Node):
             if G is None:
                 raise InstrumentError("parameter priors: expected at least one to begin learning with")
             self._begin_learning(system, G, values)
+            if values["keep"] and Path(values["keep"]).exists():
+                self._recall(values["keep"])
         self.create_service(PublishReconstructor, "srtc/publish", self._publish)
 
     def _reconstructor(self, believed: System, label: str, **keywords: Any) -> tuple[Reconstructor, Any]:
@@ -291,6 +295,23 @@ class SrtcNode(Node):
         self.create_timer(0.1, partial(self._follow, self._listener), clock=steady)
         self.create_timer(0.1, partial(self._look, self._listener), clock=steady)
         self.create_timer(1.0, partial(self._diagnose, self._listener), clock=steady)
+
+    def _recall(self, path: str) -> None:
+        """Know what an SRTC before this one learned, by the file in which the HRTC keeps what was committed last."""
+        assert self._learner is not None
+        try:
+            reconstructor = Reconstructor.load(path)
+            if reconstructor.fingerprint != self._layout.fingerprint:
+                raise ReconstructorError("made for another instrument")
+            if reconstructor.provenance.get("registration", {}) != self._places:
+                raise ReconstructorError("made for sensors in other places")
+            believed = believed_system(reconstructor.provenance, self._system)
+        except (ReconstructorError, InstrumentError) as error:
+            self.get_logger().warning(f"{path} is not used: {error}")
+            return
+        if reconstructor.label == _LEARNED:
+            self._built[_LEARNED] = Belief(_LEARNED, believed, reconstructor, self._layout)
+            self._learner.know(self._built[_LEARNED])
 
     def _on_status(self, status: HrtcStatus) -> None:
         if self._learner is not None and (self._status is None or status.reconstructor != self._status.reconstructor):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib.metadata
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numba
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from srtomo_core.layout import Layout
 from srtomo_core.reconstructor import Reconstructor
-from srtomo_core.system import System
+from srtomo_core.system import InstrumentError, System
 
 Array = NDArray[np.float64]
 
@@ -91,6 +91,25 @@ def provenance(system: System, method: str, gain: float, seconds: dict[str, floa
         },
         "seconds": seconds,
     }
+
+
+def believed_system(said: Mapping[str, Any], system: System) -> System:
+    """The instrument with the sky and the light that a reconstructor was made for.
+
+    Args:
+        said: what :func:`provenance` made, as it comes back from a file.
+        system: the instrument, whose fingerprint the reconstructor has.
+
+    Raises:
+        InstrumentError: it says no sky, or one that cannot be.
+    """
+    try:
+        sensors = said["noise"]["sensors"]
+        changes = {f"sensors.{w}.photons": sensors[sensor.name]["photons"] for w, sensor in enumerate(system.sensors)}
+        changes["atmosphere"] = said["atmosphere"]
+    except (KeyError, TypeError) as error:
+        raise InstrumentError(f"provenance: {error} is missing") from None
+    return system.with_changes(changes)
 
 
 def reconstructor_of(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -30,6 +31,7 @@ from srtomo_srtc.learn import LearnError
 from srtomo_srtc.learner import Judgement, Outcome
 from srtomo_srtc.listener import Listener
 from srtomo_srtc.node import SrtcNode
+from srtomo_srtc.reconstructors import implicit
 from srtomo_srtc.telemetry import NoWindow
 
 KEPT, FAILED = 0, 3
@@ -62,13 +64,14 @@ class Loop:
             lambda m: self.diagnostics.extend((int.from_bytes(s.level, "little"), s.message) for s in m.status),
         )
         self._frame, self._rng = 0, np.random.default_rng(1)
+        self.reconstructor = 0  # 0: the file's
 
     def _subscribe(self, kind: type, topic: wire.Topic, call: Callable[[Any], None]) -> None:
         self.node.create_subscription(kind, topic.name, call, QoSProfile(**topic.qos()))
 
     def run(self, seconds: float, sensors: int | None = 0b1111) -> None:
         """Frames at 200 Hz, answered with some sensors; None: no frames."""
-        reconstructor = self.srtc._built["file"].reconstructor.id
+        reconstructor = self.reconstructor or self.srtc._built["file"].reconstructor.id
         self._status.publish(HrtcStatus(reconstructor=reconstructor))
         for frame in range(self._frame, self._frame + (0 if sensors is None else round(200 * seconds))):
             for writer in self._sensors:
@@ -183,3 +186,29 @@ def test_health_is_live_while_a_fit_goes_on(loop: Loop, monkeypatch: pytest.Monk
         assert (srtc._order is None) == dropped
     assert srtc._reason == (0, "better; dropped: the loop runs 0000000000000005")
     over.set()
+
+
+def test_what_runs_is_known_after_a_restart(loop: Loop, tmp_path: Path) -> None:
+    """What another SRTC learned, from the file that the HRTC keeps; and another instrument's is refused."""
+    srtc, kept = loop.srtc, tmp_path / "kept.npz"
+    learned = load_system("mini").with_changes({"atmosphere.r0": 0.1, "sensors.1.photons": 2e5})
+    reconstructor, _ = implicit(learned, label="learned", closures="none")
+    reconstructor.save(kept)
+    identity = reconstructor.id
+    loop.reconstructor = identity
+    health, _ = loop.until("no reconstructor whose model is known here")
+    assert (health.decision, health.reconstructor) == (FAILED, 0)
+
+    srtc._recall(str(kept))
+    assert srtc._built["learned"].system.model_dump() == learned.model_dump()
+    assert srtc._learner is not None
+    srtc._learner.running(0)
+    srtc._learner.running(identity)
+    health, _ = loop.until("no candidate: of no sky at all")
+    assert (health.source, health.reconstructor, len(health.innovation)) == ("learned", identity, 4)
+
+    del srtc._built["learned"]
+    other = load_system("mini", {"sensors.0.subapertures": 10})
+    implicit(other, label="learned", closures="none")[0].save(kept)
+    srtc._recall(str(kept))
+    assert "learned" not in srtc._built
