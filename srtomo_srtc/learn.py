@@ -18,6 +18,7 @@ from scipy.optimize import brentq
 
 from srtomo_core.layout import Layout, SensorLayout
 from srtomo_core.system import Atmosphere, Layer, Sensor, System
+from srtomo_srtc.between import spread_between
 from srtomo_srtc.frozen_flow import independent_frames
 from srtomo_srtc.likelihood import information, inverse_of, non_negative_step, score
 from srtomo_srtc.model import layout_of
@@ -66,8 +67,8 @@ class Group:
         layers: indices, neighbours on the grid.
         altitude: of the group: mean of its layers' by strength, m above the telescope.
         fraction: of the integrated Cn2.
-        sigma: of ``fraction``.
-        n_effective: number of independent frames that its error stands for.
+        sigma: of ``fraction``; turbulence between two groups counts as shared by them, nearer ones having more.
+        n_effective: number of independent frames that its error stands for, but for turbulence in between.
         reason: why its layers are one; empty for a single layer.
     """
 
@@ -98,6 +99,9 @@ class NoiseLevel:
 class Learned:
     """What telemetry tells of the sky. 1-sigma errors everywhere.
 
+    They suppose all turbulence to be at ``altitudes`` where these were asked for; on the default grid they allow for
+    turbulence anywhere in between, as :func:`srtomo_srtc.between.spread_between` has it.
+
     Attributes:
         r0: Fried parameter at 500 nm and zenith, m.
         r0_sigma: m.
@@ -108,7 +112,7 @@ class Learned:
         groups: layers that can be told apart, lowest first.
         noise: of each sensor that takes part.
         n_frames: frames used.
-        n_effective: independent ones that r0's error stands for.
+        n_effective: independent ones that r0's error stands for, but for turbulence in between.
         iterations: that the fit took.
         measured, fitted: (n, n) covariances of the slopes that the fit worked with, rad^2.
         sampling: which these are.
@@ -129,15 +133,21 @@ class Learned:
     fitted: NDArray[np.float32]
     sampling: Sampling
 
-    def system(self, system: System, velocity: Array | None = None, layout: Layout | None = None) -> System:
+    def system(
+        self, system: System, velocity: Array | None = None, layout: Layout | None = None, *, merged: bool = False
+    ) -> System:
         """The instrument with this sky and noise in it. Sensors with a measured noise covariance keep it.
 
         Args:
             system: whose telemetry was learned from.
             velocity: (n_layers, 2) of the layers, where they go, m/s; by default that of the system's own sky.
             layout: where sensors were taken to be.
+            merged: with a layer for each group, instead of all the grid's.
         """
-        flow = winds_at(system, self.altitudes) if velocity is None else velocity
+        altitudes, fractions = self.altitudes, self.fractions
+        if merged:
+            altitudes, fractions = np.array([(group.altitude, group.fraction) for group in self.groups]).T
+        flow = winds_at(system, altitudes) if velocity is None else velocity
         layers = [
             Layer(
                 altitude=float(altitude),
@@ -145,7 +155,7 @@ class Learned:
                 wind_speed=math.hypot(*wind),
                 wind_direction=math.atan2(wind[1], wind[0]),
             )
-            for altitude, fraction, wind in zip(self.altitudes, self.fractions, flow, strict=True)
+            for altitude, fraction, wind in zip(altitudes, fractions, flow, strict=True)
             if fraction > 0
         ]
         sky = Atmosphere(r0=self.r0, outer_scale=self.outer_scale, layers=tuple(layers))
@@ -291,8 +301,8 @@ def learn(
         system: the instrument; its sky and photons are where the fit starts from, no more.
         statistics: of pseudo-open-loop slopes without blind modes.
         layout: where sensors are taken to be; as in the system when not given.
-        altitudes: of the layers to tell the turbulence from, m above the telescope, ascending; by default
-            :func:`default_altitudes`.
+        altitudes: of the layers to tell the turbulence from, m above the telescope, ascending, where all of it is then
+            supposed to be; by default :func:`default_altitudes`, with turbulence in between allowed for in the errors.
         velocity: (n_layers, 2) of these layers, where they go, m/s; by default that of the system's sky. It decides how
             many independent frames there were, and so the errors, not the estimates.
         limit: number of slopes to work with, at most about.
@@ -319,7 +329,7 @@ def learn(
     if not S.trace() > 0:
         raise LearnError("the slopes do not move")
     found = fit(model, S, *_start(system, layout, model, statistics, limit))
-    return _told(system, layout, model, found, S, statistics, grid, flow, limit)
+    return _told(system, layout, model, found, S, statistics, grid, flow, limit, anywhere=altitudes is None)
 
 
 def _start(
@@ -410,6 +420,7 @@ def _told(
     altitudes: Array,
     velocity: Array,
     limit: int,
+    anywhere: bool,
 ) -> Learned:
     n_layers, n_sensors = len(altitudes), len(model.noise)
     one_frame = np.asarray(np.linalg.inv(found.information), np.float64)
@@ -427,6 +438,10 @@ def _told(
 
     n_effective = _independent(system, layout, model, found, told @ one_frame, velocity, statistics, limit)
     sigma = np.sqrt(np.einsum("ij,jk,ik->i", told, one_frame, told) / n_effective)
+    if anywhere and n_layers > 1:
+        coarse = _coarse(system, layout, limit)
+        sky = found.strengths, found.outer_scale, found.levels
+        sigma = np.hypot(sigma, spread_between(system, layout, coarse, model.heights, *sky, told, _POWER))
     scale, scale_sigma = found.outer_scale**-_POWER, float(sigma[1 + len(groups)])
     large, small = scale - scale_sigma, scale + scale_sigma
     altitude = [float(np.average(altitudes[list(g)], weights=found.strengths[list(g)] + 1e-9 * total)) for g in groups]
@@ -452,6 +467,14 @@ def _told(
         fitted=np.asarray(found.covariance - model.unseen(1.0) * (S.trace() / len(S)), np.float32),
         sampling=model.sampling,
     )
+
+
+def _coarse(system: System, layout: Layout, limit: int) -> Sampling:
+    """Few slopes, or as many as have to be."""
+    try:
+        return Sampling.of(system, layout, min(_FEW, limit // 2), 2)
+    except ValueError:
+        return Sampling.of(system, layout, limit, 2)
 
 
 def _independent(

@@ -66,7 +66,7 @@ class LearnedSky:
     Attributes:
         learned: strengths and noise.
         system: the instrument under that sky.
-        winds: of the system's layers; empty where they were not asked for.
+        winds: of each group of layers that holds turbulence; empty where they were not asked for.
     """
 
     learned: Learned
@@ -79,7 +79,8 @@ def learned_sky(system: System, window: Statistics, *, winds: bool = False, layo
 
     Args:
         system: the instrument as its file says.
-        winds: learn them too; each is believed as far as it is known, and where it is not seen as the file has it.
+        winds: learn them too, one for layers that are told as one; each is believed as far as it is known, and where it
+            is not seen as the file has it.
         layout: where sensors are taken to be; as in the system when not given.
 
     Raises:
@@ -89,8 +90,11 @@ def learned_sky(system: System, window: Statistics, *, winds: bool = False, layo
     believed = learned.system(system, layout=layout)
     if not winds:
         return LearnedSky(learned, believed)
-    found = learn_winds(believed, window, layout)
-    believed = with_trusted_winds(with_winds(believed, found), [0.0 if wind.reason else wind.sigma for wind in found])
+    found = learn_winds(learned.system(system, layout=layout, merged=True), window, layout)
+    told = (group for group in learned.groups if group.fraction > 0)
+    of_layer = {l: wind for group, wind in zip(told, found, strict=True) for l in group.layers}
+    each = [of_layer[l] for l, fraction in enumerate(learned.fractions) if fraction > 0]
+    believed = with_trusted_winds(with_winds(believed, each), [0.0 if wind.reason else wind.sigma for wind in each])
     return LearnedSky(learned, believed, found)
 
 

@@ -40,14 +40,10 @@ def learned_fields(system: System, sky: LearnedSky, window: Statistics) -> dict[
     """
     learned, groups = sky.learned, sky.learned.groups
     winds, wind_error = winds_at(system, np.array([group.altitude for group in groups])), np.full(len(groups), math.nan)
-    for g, group in enumerate(groups):
-        seen = [
-            wind for wind in sky.winds if not wind.reason and wind.altitude in learned.altitudes[list(group.layers)]
-        ]
-        if seen:
-            share = np.array([wind.fraction for wind in seen]) / sum(wind.fraction for wind in seen)
-            winds[g] = share @ np.array([wind.velocity for wind in seen])
-            wind_error[g] = math.hypot(*share * [wind.sigma for wind in seen])
+    told = [g for g, group in enumerate(groups) if group.fraction > 0]
+    for g, wind in zip(told, sky.winds):  # none where they were not asked for
+        if not wind.reason:
+            winds[g], wind_error[g] = wind.velocity, wind.sigma
     speed = np.hypot(*winds.T)
     low, high = learned.outer_scale_range
     noise = np.full((2, len(system.sensors)), math.nan)

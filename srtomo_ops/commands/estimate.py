@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -16,15 +17,21 @@ from srtomo_core.layout import Layout
 from srtomo_core.reconstructor import load_interaction_matrix
 from srtomo_core.system import System
 from srtomo_ops.options import add_registration, writable_file, write_json
-from srtomo_srtc.learn import LIMIT, Learned, learn
+from srtomo_srtc.learn import LIMIT, Group, Learned, learn
+from srtomo_srtc.learn_wind import LayerWind, learn_winds
+from srtomo_srtc.learner import lags_of
 from srtomo_srtc.mirrors import interaction_matrix
 from srtomo_srtc.registration import registered_layout
 from srtomo_srtc.sampling import FEWEST, Sampling
-from srtomo_srtc.telemetry import Statistics, Telemetry
+from srtomo_srtc.telemetry import COUNTED_RATE, Statistics, Telemetry
 
 EXAMPLE = """examples:
   srtomo estimate night1 --plot night1.png
-  srtomo estimate night1 --altitudes 0,4000,8000,16000 -o sky.json"""
+  srtomo estimate night1 --altitudes 0,4000,8000,16000 -o sky.json
+  srtomo estimate night1 --winds"""
+
+BETWEEN = "errors allow for turbulence anywhere between these altitudes"
+ONLY_AT = "errors suppose that all turbulence is at these altitudes"
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -34,8 +41,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--altitudes",
         metavar="M,M,...",
         type=_altitudes,
-        help="of the layers, m above the telescope, ascending (default: what the stars can tell apart)",
+        help="of the layers, m above the telescope, ascending; errors suppose that all turbulence is there "
+        "(default: a grid as fine as the stars can tell, with turbulence in between allowed for in the errors)",
     )
+    parser.add_argument("--winds", action="store_true", help="learn the wind of each group of layers too")
     parser.add_argument(
         "--interaction-matrix",
         metavar="FILE",
@@ -72,26 +81,32 @@ def main(options: argparse.Namespace) -> int:
         system = System.model_validate_json(text)
         layout, _ = registered_layout(options.registration, system)
         Sampling.of(system, layout, options.slopes)  # before any work
-        statistics = _statistics(reader, system, layout, options.interaction_matrix)
+        statistics = _statistics(reader, system, layout, options.interaction_matrix, options.winds)
     start = time.perf_counter()
     learned = learn(system, statistics, layout=layout, altitudes=options.altitudes, limit=options.slopes)
+    found: tuple[LayerWind, ...] = ()
+    if options.winds:
+        found = learn_winds(learned.system(system, layout=layout, merged=True), statistics, layout)
+    winds = dict(zip((group for group in learned.groups if group.fraction > 0), found))
     seconds = time.perf_counter() - start
-    _print(system, statistics, learned)
+    supposed = BETWEEN if options.altitudes is None else ONLY_AT
+    _print(system, statistics, learned, winds, supposed)
     if options.plot is not None:
         from srtomo_ops.report import sky_figure
 
         sky_figure(options.plot, system, learned)
-    write_json(options.output, {**_numbers(system, statistics, learned), "seconds": seconds})
+    write_json(options.output, {**_numbers(system, statistics, learned, winds), "errors": supposed, "seconds": seconds})
     return 0
 
 
-def _statistics(reader: BagReader, system: System, layout: Layout, matrix: Path | None) -> Statistics:
+def _statistics(reader: BagReader, system: System, layout: Layout, matrix: Path | None, winds: bool) -> Statistics:
     G: NDArray[np.floating] = (
         interaction_matrix(system, layout) if matrix is None else load_interaction_matrix(matrix, layout.fingerprint)
     )
     first, last = reader.time_range
+    lags = lags_of(system, max(1, round(system.loop.rate / COUNTED_RATE))) if winds else ()
     # one block, longer than the bag: nothing is forgotten or held out
-    telemetry = Telemetry(system, G, layout=layout, window=(last - first) * 1e-9 + 1, blocks=1, held_out=0)
+    telemetry = Telemetry(system, G, layout=layout, window=(last - first) * 1e-9 + 1, blocks=1, held_out=0, lags=lags)
     telemetry.feed(reader)
     statistics = telemetry.statistics()
     if telemetry.tally.sessions > 1:
@@ -102,7 +117,9 @@ def _statistics(reader: BagReader, system: System, layout: Layout, matrix: Path 
     return statistics
 
 
-def _print(system: System, statistics: Statistics, learned: Learned) -> None:
+def _print(
+    system: System, statistics: Statistics, learned: Learned, winds: Mapping[Group, LayerWind], supposed: str
+) -> None:
     low, high = learned.outer_scale_range
     seen = f"{low:.0f} to {high:.0f} m" if math.isfinite(high) else f"above {low:.0f} m"
     print(
@@ -117,12 +134,21 @@ def _print(system: System, statistics: Statistics, learned: Learned) -> None:
         where = ends[0] if len(group.layers) == 1 else f"{ends[0]} to {ends[1]}"
         why = f"   {len(group.layers)} layers told as one: {group.reason}" if group.reason else ""
         print(f"  {where:<18} {group.fraction:6.3f} +- {group.sigma:.3f}{why}")
+    print(f"  {supposed}")
+    if winds:
+        print(f"  {'altitude [m]':<18} {'wind [m/s]':>14} {'going to [deg from +x]':>26}")
+    for group, wind in reversed(list(winds.items())):
+        turn = f"{math.degrees(wind.direction):4.0f} +- {math.degrees(wind.sigma / max(wind.speed, wind.sigma)):.0f}"
+        told = wind.reason or f"{wind.speed:6.1f} +- {wind.sigma:.1f} {turn:>26}"
+        print(f"  {group.altitude:<18.0f} {told}")
     print("  noise variance over that of the instrument file")
     for level in learned.noise:
         print(f"  {system.sensors[level.sensor].name:<18} {level.factor:6.3f} +- {level.sigma:.3f}")
 
 
-def _numbers(system: System, statistics: Statistics, learned: Learned) -> dict[str, Any]:
+def _numbers(
+    system: System, statistics: Statistics, learned: Learned, winds: Mapping[Group, LayerWind]
+) -> dict[str, Any]:
     low, high = learned.outer_scale_range
     return {
         "system": system.name,
@@ -143,6 +169,7 @@ def _numbers(system: System, statistics: Statistics, learned: Learned) -> dict[s
                 "fraction": group.fraction,
                 "sigma": group.sigma,
                 "reason": group.reason,
+                **(_wind(winds[group]) if group in winds else {}),
             }
             for group in learned.groups
         ],
@@ -150,4 +177,14 @@ def _numbers(system: System, statistics: Statistics, learned: Learned) -> dict[s
             {"sensor": system.sensors[level.sensor].name, "variance_factor": level.factor, "sigma": level.sigma}
             for level in learned.noise
         ],
+    }
+
+
+def _wind(wind: LayerWind) -> dict[str, Any]:
+    if wind.reason:
+        return {"wind_reason": wind.reason}
+    return {
+        "wind_speed_mps": wind.speed,
+        "wind_direction_deg": math.degrees(wind.direction),
+        "wind_sigma_mps": wind.sigma,
     }

@@ -1,12 +1,15 @@
 """``srtomo estimate`` as a user calls it, on the golden bag."""
 
+import cmath
 import json
+import math
 from pathlib import Path
 
 import pytest
 
 from srtomo_core import wire
 from srtomo_core.bag import BagReader, BagWriter
+from srtomo_core.system import load_system
 from srtomo_ops.cli import main
 
 BAG = Path(__file__).parents[2] / "bags" / "mini"
@@ -29,7 +32,10 @@ def with_another_session(path: Path, messages: int) -> Path:
 
 def test_a_bag_s_sky(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file, plot = tmp_path / "sky.json", tmp_path / "sky.png"
-    assert main(["estimate", str(BAG), "--altitudes", "0,3000,10000", "-o", str(file), "--plot", str(plot)]) == 0
+    assert (
+        main(["estimate", str(BAG), "--altitudes", "0,3000,10000", "--winds", "-o", str(file), "--plot", str(plot)])
+        == 0
+    )
     sky = json.loads(file.read_text())
     # 0.7 s are worth about seven frames: no more than the order of magnitude is certain
     assert 0.12 < sky["r0_m"] < 0.2
@@ -37,7 +43,13 @@ def test_a_bag_s_sky(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     assert sum(group["fraction"] for group in sky["groups"]) == pytest.approx(1)
     assert [level["sensor"] for level in sky["noise"]] == ["lgs1", "lgs2", "lgs3"]
     assert 0.7 < min(level["variance_factor"] for level in sky["noise"])
+    # the winds that the bag was recorded with
+    for group, layer in zip(sky["groups"], load_system("mini").atmosphere.layers, strict=True):
+        off = cmath.rect(group["wind_speed_mps"], math.radians(group["wind_direction_deg"]))
+        off -= cmath.rect(layer.wind_speed, layer.wind_direction)
+        assert abs(off) < 3 * group["wind_sigma_mps"] < 2
     out = capsys.readouterr().out
+    assert "errors suppose that all turbulence is at these altitudes" in out
     assert f"{100 * sky['r0_m']:.2f} +- {100 * sky['r0_sigma_m']:.2f} cm" in out
     assert plot.read_bytes()[:4] == b"\x89PNG"
 

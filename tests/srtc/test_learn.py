@@ -262,6 +262,27 @@ def test_the_default_altitudes_are_what_the_stars_resolve() -> None:
     assert len(default_altitudes(load_system("mavis"), Layout(load_system("mavis")))) == 10
 
 
+def test_errors_on_the_default_grid_allow_for_turbulence_in_between(system: System) -> None:
+    # layers at altitudes drawn without regard to the grid; no chance but that
+    layout = Layout(system)
+    grid, sampling = default_altitudes(system, layout), Sampling.of(system, layout, 2000)
+    pulls = []
+    for number in range(3):
+        draw = np.random.default_rng([13, number])
+        n = int(draw.integers(3, 7))
+        at, fractions, levels = np.sort(draw.uniform(0, 16e3, n)), draw.dirichlet(np.full(n, 2.0)), [2.0, 0.7, 1.3]
+        model = SkyModel(system, layout, sampling, at * system.airmass)
+        strengths = (0.15 * math.cos(system.zenith_angle) ** 0.6) ** (-5 / 3) * fractions
+        C = model.turbulence(strengths, 25.0) + sum(level * noise for level, noise in zip(levels, model.noise))
+        told = learn(system, statistics(C, 10**6))
+        shares = fractions @ np.array([np.interp(at, grid, unit) for unit in np.eye(len(grid))]).T
+        pulls += [(group.fraction - shares[list(group.layers)].sum()) / group.sigma for group in told.groups]
+        pulls.append((told.r0 - 0.15) / told.r0_sigma)
+        pulls += [(level.factor - levels[level.sensor]) / level.sigma for level in told.noise]
+    assert 0.4 < np.sqrt(np.mean(np.square(pulls))) < 1.3
+    assert np.abs(pulls).max() < 3
+
+
 # --- frames ---------------------------------------------------------------------------------------------------------
 
 
