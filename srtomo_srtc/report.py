@@ -35,6 +35,8 @@ def believed_fields(system: System) -> dict[str, Any]:
 def learned_fields(system: System, sky: LearnedSky, window: Statistics) -> dict[str, Any]:
     """Fields of an AtmosphereProfile for what was learned from a window: a layer for each group that can be told.
 
+    Of an outer scale that is not seen the lower limit is in the text: its error can have two sides only.
+
     Args:
         system: the instrument; its winds are supposed where none were learned.
     """
@@ -50,6 +52,7 @@ def learned_fields(system: System, sky: LearnedSky, window: Statistics) -> dict[
     for level in learned.noise:
         rms = math.sqrt(level.factor)
         noise[:, level.sensor] = rms, level.sigma / (2 * rms)
+    unseen = [] if math.isfinite(high) else [f"outer scale above {low:.0f} m"]
     return {
         "r0": learned.r0,
         "outer_scale": learned.outer_scale,
@@ -69,7 +72,9 @@ def learned_fields(system: System, sky: LearnedSky, window: Statistics) -> dict[
         "wind_direction_error": (wind_error / np.maximum(speed, wind_error)).tolist(),
         "noise": noise[0].tolist(),
         "noise_error": noise[1].tolist(),
-        "text": "; ".join(f"at {group.altitude:.0f} m: {group.reason}" for group in groups if group.reason),
+        "text": "; ".join(
+            [*(f"at {group.altitude:.0f} m: {group.reason}" for group in groups if group.reason), *unseen]
+        ),
     }
 
 

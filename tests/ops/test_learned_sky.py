@@ -115,6 +115,8 @@ def test_gnao_in_closed_loop(seed: int) -> None:
     assert abs(errors[1]) < 0.02
     assert np.all(np.abs(found - wanted) < [0.03, 0.02, 0.015])
     assert np.abs(noise).max() < 0.02
+    # no split below 4 km is told, which would be beyond what the stars see
+    assert [group.layers for group in whole.groups] == [(0, 1, 2, 3, 4), (5,), (6,)]
     assert wfe[1] < wfe[0] + 1e-9
 
 

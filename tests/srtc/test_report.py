@@ -65,7 +65,7 @@ def test_a_learned_sky(mini: System, window: Statistics) -> None:
     assert (message.session, message.first_frame, message.last_frame, message.n_frames) == (7, 100, 1100, 500)
     assert message.altitude == pytest.approx([500, 9000])
     assert message.fraction_error == pytest.approx([0.02, 0.01])
-    assert message.text == "at 500 m: they correlate"
+    assert message.text == "at 500 m: they correlate; outer scale above 15 m"
     # rms over the file's, of the sensors that told
     assert message.noise == pytest.approx([2.0, math.nan, 1.0, math.nan], nan_ok=True)
     assert message.noise_error == pytest.approx([0.1, math.nan, 0.05, math.nan], nan_ok=True)
