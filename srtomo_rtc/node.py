@@ -106,14 +106,19 @@ _PARAMETERS: tuple[tuple[str, Any, ParameterDescriptor], ...] = (
         "kernel",
         "auto",
         _read_only(
-            "matrix-vector kernel: float32; int16, half the memory traffic; auto: float32, others only measured"
+            "matrix-vector kernel: float32; int16, half the memory traffic; tlr, R in tiles of low rank; "
+            "auto: float32, int16 only measured"
         ),
     ),
     ("threads", 0, _integer("that share a product, the loop's included; 0: by measurement", 0, MAX_THREADS, True)),
     ("waiting", "auto", _read_only("how the compiled path waits: blocking, polling, or auto: by the cores there are")),
     ("cores", "", _read_only("cores of the loop's thread, as 2,3; with several threads one each; empty: any")),
     ("fifo_priority", 0, _integer("SCHED_FIFO priority of the process; 0: normal scheduling", 0, 99, True)),
-    ("deadline", 0.0, _read_only("latency above which a frame is a miss, s; 0: the loop's delay less one exposure")),
+    (
+        "deadline",
+        0.0,
+        _number("latency above which a frame is a miss, s; 0: the loop's delay less one exposure", 0.0, 3600.0, True),
+    ),
     ("ring", 10.0, _number("s of messages kept in shared memory for the recorder; 0: none", 0.0, 600.0, True)),
     ("polc", True, ParameterDescriptor(description="pseudo-open-loop control; false: classical leaky integrator")),
     ("leak", 0.0, _number("leak of a frame; 0 at configure: the instrument's", 0.0, 0.999)),
@@ -237,7 +242,10 @@ class HrtcNode(LifecycleNode):
     def _configure(self) -> None:
         if not self._value("system"):
             raise InstrumentError("parameter system: expected a name or the path of a .yaml file")
-        changes = json.loads(self._value("changes"))
+        try:
+            changes = json.loads(self._value("changes"))
+        except json.JSONDecodeError:
+            changes = None
         if not isinstance(changes, dict):
             raise InstrumentError(f"parameter changes: expected a JSON object, got {self._value('changes')}")
         system = load_system(self._value("system"), changes)
@@ -263,6 +271,8 @@ class HrtcNode(LifecycleNode):
             self._cores = [int(word) for word in self._value("cores").split(",") if word]
         except ValueError:
             raise ValueError(f"parameter cores: expected numbers as 2,3, got {self._value('cores')}") from None
+        if len(set(self._cores)) < len(self._cores):
+            raise ValueError(f"parameter cores: expected each core once, got {self._value('cores')}")
         swap = Swap(
             system, layout, G_cal, settings, self._post, self._value("max_epochs"), kernel, self._value("max_closures")
         )

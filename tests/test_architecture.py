@@ -30,6 +30,7 @@ MAY_IMPORT_ROS = (
     "srtomo_ops/publish.py",
     "srtomo_ops/demo.py",
     "srtomo_ops/commands/ctl.py",
+    "srtomo_ops/commands/nodes.py",  # says which parameter a node refused
     "srtomo_ops/commands/bench.py",  # asks whether it is there
     "srtomo_ops/bench/path.py",
     "srtomo_ops/bench/path_node.py",

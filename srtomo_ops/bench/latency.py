@@ -197,8 +197,10 @@ class Problem:
         """Random slopes, and a damped least-squares reconstructor unless one is given: only its size sets the time.
 
         Raises:
-            ValueError: the reconstructor is of another instrument, or predictive.
+            ValueError: the reconstructor is of another instrument, or predictive; tip-tilt has a loop of its own.
         """
+        if system.loop.tip_tilt is not None:
+            raise ValueError(f"{system.name}: has tip-tilt in a loop of its own, which is not timed")
         layout = Layout(system)
         G = interaction_matrix(system, layout)
         if reconstructor is None:

@@ -62,7 +62,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     loop.add_argument("--pairs", type=int, default=10, help="of turns, HRTC and echo, of each arrival (default: 10)")
     loop.add_argument("--packets", type=int, default=4, help="a sensor and frame when staggered (default: 4)")
-    loop.add_argument("--fifo-priority", type=int, default=0, help="SCHED_FIFO (default: 0, none)")
+    loop.add_argument("--fifo-priority", type=int, default=0, help="SCHED_FIFO, also of kernels (default: 0, none)")
     loop.add_argument("--compute-only", action="store_true", help="without processes, without ROS")
     loop.add_argument(
         "--reconstructor",
@@ -129,6 +129,7 @@ def _kernels(options: argparse.Namespace) -> int:
     for name in ("frames", "threads"):
         if getattr(options, name) < 1:
             raise ValueError(f"--{name}: expected at least 1, got {getattr(options, name)}")
+    _check_priority(options)
     system = system_of(options)
     with Progress("kernels") as progress:
         rows = kernels.measure(
@@ -152,7 +153,15 @@ def _kernels(options: argparse.Namespace) -> int:
     return 0
 
 
+def _check_priority(options: argparse.Namespace) -> None:
+    if not 0 <= options.fifo_priority <= 99:
+        raise ValueError(f"--fifo-priority: expected 0 to 99, got {options.fifo_priority}")
+
+
 def _latency(options: argparse.Namespace) -> int:
+    _check_priority(options)
+    if options.fifo_priority and options.compute_only:
+        raise ValueError("--fifo-priority: of the whole path, not of --compute-only")
     for name, least in (("frames", 5), ("pairs", 2), ("packets", 1)):
         if getattr(options, name) < least:
             raise ValueError(f"--{name}: expected at least {least}, got {getattr(options, name)}")

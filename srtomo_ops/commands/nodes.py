@@ -50,6 +50,8 @@ def quoted(parameter: str, defaults: dict[str, Any]) -> str:
     if isinstance(defaults[name], str) and not value.startswith(("'", '"')):
         value = "'" + value.replace("'", "''") + "'"
         return f"{name}:={value}"
+    if isinstance(defaults[name], float) and value.lstrip("+-").isdecimal():
+        return f"{parameter}.0"  # a whole number is no floating-point one to ROS
     return parameter
 
 
@@ -67,4 +69,9 @@ def main(options: argparse.Namespace) -> int:
     defaults = {name: default for name, default, _ in module.parameters()}
     parameters = [quoted(parameter, defaults) for parameter in options.p]
     arguments = ros_arguments(options.system, changes_of(options), options.namespace, parameters)
-    return int(module.main(arguments))
+    from rclpy.exceptions import ParameterException
+
+    try:
+        return int(module.main(arguments))
+    except ParameterException as error:  # of a wrong type, or out of its range; names it
+        raise ValueError(f"-p: {error}") from None

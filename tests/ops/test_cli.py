@@ -186,6 +186,9 @@ def test_simulate_closes_the_loop(capsys) -> None:
         ("demo mini -o /proc/demo", "/proc/demo: No such file"),
         ("hrtc nowhere", "nowhere: expected the path of a .yaml file"),
         ("hrtc mini -p leak", "-p leak: expected NAME:=VALUE"),
+        ("bench latency mini --fifo-priority 400", "--fifo-priority: expected 0 to 99, got 400"),
+        ("bench latency mini --fifo-priority 5 --compute-only", "--fifo-priority: of the whole path, not of --compute"),
+        ("bench latency mini_tip_tilt", "mini_tip_tilt: has tip-tilt in a loop of its own"),
         ("ctl commit 12", "commit: expected ID SHA256 after it, got 12"),
         ("ctl roll-back 12 zz", "expected ID and SHA256 in hex, as 'srtomo ctl publish' prints them, got 12 zz"),
         ("ctl wrong", "invalid choice: 'wrong'"),
@@ -228,12 +231,14 @@ def _apart(*words: str) -> subprocess.CompletedProcess[str]:
 
 
 def test_text_with_brackets_stays_text() -> None:
-    defaults = {"schedule": "", "frames": 10, "priors": ["file"]}
+    defaults = {"schedule": "", "frames": 10, "over": 0.0, "priors": ["file"]}
     for given, passed in (
         ('schedule:=[{"at": 5}]', """schedule:='[{"at": 5}]'"""),
         ("schedule:='[]'", "schedule:='[]'"),
         ("schedule:=it's", "schedule:='it''s'"),
         ("frames:=20", "frames:=20"),
+        ("over:=20", "over:=20.0"),
+        ("over:=2e1", "over:=2e1"),
         ("priors:=[ground]", "priors:=[ground]"),
     ):
         assert quoted(given, defaults) == passed
@@ -257,4 +262,19 @@ def test_a_node_lists_its_parameters_and_refuses_others() -> None:
     refused = _apart("hrtc", "mini", "-p", "lek:=0.1")
     assert refused.returncode == 2
     assert refused.stderr.startswith("srtomo hrtc: -p lek:=0.1: no such parameter (expected one of system")
+    assert len(refused.stderr.splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("command", "given", "news"),
+    [
+        ("hrtc", "fifo_priority:=high", "'fifo_priority' to 'high'"),
+        ("hrtc", "deadline:=-1", "deadline out of range"),
+        ("sim", "seed:=x", "'seed' to 'x'"),
+    ],
+)
+def test_a_parameter_of_a_wrong_type_or_out_of_range_is_one_line(ros_domain, command, given, news) -> None:
+    refused = _apart(command, "mini", "-p", given)
+    assert refused.returncode == 2
+    assert refused.stderr.startswith(f"srtomo {command}: -p: ") and news in refused.stderr
     assert len(refused.stderr.splitlines()) == 1
