@@ -32,9 +32,11 @@ from __future__ import annotations
 import fcntl
 import mmap
 import os
+import stat
 import struct
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 from typing import NamedTuple
@@ -66,13 +68,19 @@ class Record(NamedTuple):
 def ring_path(domain: int, namespace: str, name: str = "hrtc") -> Path:
     """Where the ring of a ROS domain and namespace is."""
     place = "-".join(part for part in namespace.split("/") if part)
-    return Path("/dev/shm") / "-".join(filter(None, ("srtomo", str(os.getuid()), str(domain), place, f"{name}.ring")))
+    return Path("/dev/shm") / (_own() + "-".join(filter(None, (str(domain), place, f"{name}.ring"))))
+
+
+def _own() -> str:
+    """What the names of this user's rings begin with."""
+    return f"srtomo-{os.getuid()}-"
 
 
 class RingWriter:
     """Makes a ring and writes to it. One thread.
 
-    The file is locked as long as the writer lives, whatever ends it: what a killed one left is taken over by the next.
+    The file is locked as long as the writer lives, whatever ends it: what killed ones left, the next removes, whichever
+    domain and namespace it is for. Readers keep what they have mapped.
 
     Args:
         path: of the file to make, in shared memory.
@@ -90,6 +98,7 @@ class RingWriter:
         self.path = path
         self.capacity = -(-capacity // 64) * 64
         self._number = 0
+        _remove_left_behind(path.parent)
         self._fd = _lock_new(path)
         try:
             os.posix_fallocate(self._fd, 0, _DATA + self.capacity)  # or a full /dev/shm would end the process later
@@ -173,11 +182,28 @@ def _lock_new(path: Path) -> int:
                 raise RingError(f"{path}: in use by another process") from None
             time.sleep(0.001)
             continue
-        if os.fstat(fd).st_size == 0 and os.fstat(fd).st_nlink:
+        found = os.fstat(fd)
+        if found.st_size == 0 and found.st_nlink:
             return fd
         # readers of the old one keep their mapping of it: it is not written over, but given up
-        path.unlink(missing_ok=True)
+        if found.st_nlink:  # otherwise it was removed meanwhile, and what has the name now is another's
+            path.unlink(missing_ok=True)
         os.close(fd)
+
+
+def _remove_left_behind(folder: Path) -> None:
+    """Remove this user's rings that no writer holds. Who makes one just now, and finds it removed, makes it again."""
+    for path in folder.glob(f"{_own()}*.ring"):
+        with suppress(OSError):  # in use, or gone
+            fd = os.open(path, os.O_RDWR | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
+            try:
+                fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                found = os.fstat(fd)
+                # with the lock nobody else removes or replaces it; without the look it might be the name's next holder
+                if stat.S_ISREG(found.st_mode) and found.st_uid == os.getuid() and os.path.samestat(found, path.stat()):
+                    path.unlink()
+            finally:
+                os.close(fd)
 
 
 class RingReader:

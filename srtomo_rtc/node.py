@@ -119,7 +119,11 @@ _PARAMETERS: tuple[tuple[str, Any, ParameterDescriptor], ...] = (
         0.0,
         _number("latency above which a frame is a miss, s; 0: the loop's delay less one exposure", 0.0, 3600.0, True),
     ),
-    ("ring", 10.0, _number("s of messages kept in shared memory for the recorder; 0: none", 0.0, 600.0, True)),
+    (
+        "ring",
+        10.0,
+        _number("s of messages, one a sensor, kept in shared memory for the recorder; 0: none", 0.0, 600.0, True),
+    ),
     ("polc", True, ParameterDescriptor(description="pseudo-open-loop control; false: classical leaky integrator")),
     ("leak", 0.0, _number("leak of a frame; 0 at configure: the instrument's", 0.0, 0.999)),
     ("relaxation", 0.1, _number("share of the command that an open loop drops each frame", 0.001, 1.0)),
@@ -376,18 +380,22 @@ class HrtcNode(LifecycleNode):
     def _open_ring(self, hrtc: Hrtc) -> None:
         """While the loop runs everything that it takes and publishes goes into a ring, if there can be one.
 
-        Its length holds for one message a sensor; packets have more heads, and fill it sooner.
+        Its length holds for one message a sensor; packets have more heads, and fill it sooner, those of a row most.
         """
         name, seconds = "telemetry ring", self._value("ring")
         outcome = realtime.Outcome(name, True, "not asked for")
         if seconds:
-            layout, messages = self._layout, len(self._layout.sensors) + 1
-            a_frame = 4 * (layout.n_slopes + layout.n_commands) + _MESSAGE_HEAD * messages
-            capacity = max(math.ceil(seconds * self._rate * a_frame), _LEAST_RING)
+            layout, sensors = self._layout, self._layout.sensors
+            whole, rows = (
+                4 * (layout.n_slopes + layout.n_commands) + _MESSAGE_HEAD * (messages + 1)
+                for messages in (len(sensors), sum(len(sensor.mask) for sensor in sensors))
+            )
+            capacity = max(math.ceil(seconds * self._rate * whole), _LEAST_RING)
+            length = f"{seconds:g} s, {capacity / (self._rate * rows):.2g} s in packets of a row"
             path = ring_path(self.context.get_domain_id(), self.get_namespace())
             try:
                 self._ring = RingWriter(path, capacity)
-                outcome = realtime.Outcome(name, True, f"{seconds:g} s ({capacity / 2**20:.0f} MiB, {path.name})")
+                outcome = realtime.Outcome(name, True, f"{length} ({capacity / 2**20:.0f} MiB, {path.name})")
             except OSError as error:
                 outcome = realtime.Outcome(name, False, f"{error}; the recorder has to rely on its subscriptions")
         hrtc.record_to(self._ring)

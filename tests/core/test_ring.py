@@ -2,6 +2,7 @@ import multiprocessing
 import os
 import signal
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -114,6 +115,38 @@ def _reader_of_another_process(path: Path) -> RingReader:
         except RingError:
             assert time.monotonic() < deadline
             time.sleep(0.01)
+
+
+def test_what_killed_writers_left_goes_with_the_next_start_of_any_other(tmp_path: Path) -> None:
+    """Rings of this user that nobody holds, and nothing else."""
+    mine = f"srtomo-{os.getuid()}-"
+    left, alive = (tmp_path / f"{mine}{name}-hrtc.ring" for name in ("3-gnao", "4"))
+    others = [tmp_path / name for name in (f"srtomo-{os.getuid()}1-3-hrtc.ring", f"{mine}3.other", "3-hrtc.ring")]
+    with RingWriter(left, 1 << 14) as killed:
+        killed.write(0, 0, b"not read yet")
+        reader, content = RingReader(left), left.read_bytes()
+    left.write_bytes(content)
+    for other in others:
+        other.write_bytes(content)
+    os.mkfifo(tmp_path / f"{mine}pipe.ring")  # does not hold the cleaner up
+    (tmp_path / f"{mine}link.ring").symlink_to(others[0])
+    with RingWriter(alive, 1 << 14), RingWriter(tmp_path / f"{mine}5-hrtc.ring", 1 << 14):
+        assert not left.exists()
+        assert alive.exists() and all(other.exists() for other in others)
+    assert [record.data for record in reader.read()] == [b"not read yet"]
+
+
+def test_writers_that_start_at_once_remove_nobody_s_ring(tmp_path: Path) -> None:
+    def make_and_close(domain: int) -> None:
+        path = tmp_path / f"srtomo-{os.getuid()}-{domain}-hrtc.ring"
+        for _ in range(200):
+            with RingWriter(path, 1 << 12) as writer:
+                assert path.exists()
+                writer.write(0, 0, b"x")
+
+    with ThreadPoolExecutor(4) as pool:  # locks are of open files, not of processes
+        list(pool.map(make_and_close, range(4)))
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_no_room_is_said_in_one_line(path: Path) -> None:

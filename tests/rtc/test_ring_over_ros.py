@@ -163,7 +163,7 @@ def rig(start_process, mini, tmp_path, ros_domain):
 @pytest.mark.parametrize("path", ["compiled", pytest.param("rclpy", marks=pytest.mark.slow)])
 def test_all_is_recorded_from_the_ring_and_replays(rig, path):
     rig.start_hrtc(f"frame_path:={path}")
-    assert f"telemetry ring 10 s (5 MiB, {rig.ring.name})" in rig.operator.hrtc.realtime
+    assert f"telemetry ring 10 s, 3.8 s in packets of a row (5 MiB, {rig.ring.name})" in rig.operator.hrtc.realtime
     rig.start_recorder()
     rig.operator.close_loop(True)
     rig.run(500)
