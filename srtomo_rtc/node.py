@@ -62,6 +62,7 @@ _RESEND_AFTER = 1.0  # s without a new block before missing ones are asked for
 _SILENT = 0.1  # s without slopes that are worth a warning
 _SILENT_STARS = 1.0  # s without slopes of tip-tilt's own stars, which are slow, that are worth a warning
 _GIVE_UP_AFTER = 10.0  # s without a new block before a transfer is refused
+_SPEAKS_WITHIN = 1.0  # s in which another HRTC that is active would say so: ten times over
 _MESSAGE_HEAD = 192  # bytes of a message in the ring beside its slopes or commands, about
 _LEAST_RING = 1 << 20  # bytes
 
@@ -164,6 +165,10 @@ class HrtcNode(LifecycleNode):
         self.create_service(SwapReconstructor, "hrtc/roll_back", self._roll_back)
         self.create_service(SetStaticShape, "hrtc/static_shape", self._static_shape)
         self.create_service(CloseSensor, "hrtc/close_sensor", self._close_sensor)
+        # taken from when an activation asks, never by the executor
+        self._statuses = self._hot_node.create_subscription(
+            HrtcStatus, wire.STATUS.name, lambda _: None, QoSProfile(**wire.STATUS.qos(1))
+        )
         self._resend = self.create_client(PublishReconstructor, "srtc/publish")
         self.create_subscription(
             ReconstructorMsg, wire.RECONSTRUCTOR.name, self._on_manifest, QoSProfile(**wire.RECONSTRUCTOR.qos())
@@ -372,10 +377,35 @@ class HrtcNode(LifecycleNode):
 
     def _activate(self) -> None:
         assert self._hrtc is not None
+        self._refuse_beside_another()
         self._hrtc.stopping = False
         self._open_ring(self._hrtc)
         self._thread = threading.Thread(target=self._run, name="loop", daemon=True)
         self._thread.start()
+
+    def _refuse_beside_another(self) -> None:
+        """A plant would obey whichever of two commands comes first.
+
+        Who publishes commands, the middleware knows, but it misses one that was killed only after many seconds. That
+        one says nothing any more.
+
+        Raises:
+            Refused: another HRTC of this namespace is active.
+        """
+        assert self._hot is not None
+        if not self._hot.rivals():
+            return
+        self._next_status()  # whoever's it is, it is of before
+        end = time.monotonic() + _SPEAKS_WITHIN
+        while time.monotonic() < end:
+            said = self._next_status()  # of others alone: this thread would publish our own
+            if said is not None and said.state == "active":
+                raise Refused(f"another HRTC is active in namespace {self.get_namespace()}: deactivate or end it first")
+            time.sleep(0.01)
+
+    def _next_status(self) -> HrtcStatus | None:
+        taken = self._statuses.handle.take_message(HrtcStatus, False)
+        return None if taken is None else taken[0]
 
     def _open_ring(self, hrtc: Hrtc) -> None:
         """While the loop runs everything that it takes and publishes goes into a ring, if there can be one.

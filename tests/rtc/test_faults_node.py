@@ -30,7 +30,7 @@ from msgs_schema.msg import ReconstructorBlock as ReconstructorBlockMsg
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
-from srtomo_ops.operator import Operator, OperatorError
+from srtomo_ops.operator import TRANSITIONS, Operator, OperatorError
 
 BUDGET = 20
 PATIENCE = 30.0  # s, on a machine that others use
@@ -620,6 +620,35 @@ def assert_flat_at_the_end(loop: Wire, process: Any, signal: str) -> None:
     flat = loop.commands[-1]
     assert (flat.frame, flat.verdict, flat.loop_state) == (k, Verdict.OPEN, HrtcEvent.OPEN)
     assert not flat.commands.any()
+
+
+def test_a_second_hrtc_is_not_activated_beside_one_that_lives(
+    start, start_shared_process, wired, matrix_file, first_matrix
+):
+    """It says why; killed, the first one is in its way no longer, though the middleware still counts it."""
+    first = start("pair", f"reconstructor:={first_matrix}")
+    loop = wired("pair")
+    make_sure_it_is_closed(loop)
+    second = start_shared_process(
+        *("-m", "srtomo_rtc.node", "--ros-args", "-r", "__ns:=/pair", "-r", "hrtc:__node:=second"),
+        *("-p", "system:=mini", "-p", f"interaction_matrix:={matrix_file}"),
+    )
+
+    def ask(label: str) -> bool:
+        request = ChangeState.Request(transition=Transition(id=TRANSITIONS[label], label=label))
+        return bool(loop.operator.call(ChangeState, "second/change_state", request).success)
+
+    assert ask("configure")
+    assert not ask("activate")
+    second.wait_for("another HRTC is active in namespace /pair: deactivate or end it first")
+    assert "Traceback" not in second.output
+    loop.status(lambda status: status.state == "inactive")
+    assert loop.run(20) == [Verdict.OK] * 20  # one command each
+    first.kill()
+    assert loop.operator.count_publishers(wire.COMMAND.name) == 2
+    assert ask("activate")
+    loop.status(lambda status: status.state == "active")
+    assert second.terminate() == 0, second.output
 
 
 @pytest.mark.slow
