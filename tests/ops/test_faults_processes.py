@@ -329,33 +329,24 @@ def test_forged_commands(instrument):
 
 
 def test_a_second_hrtc(instrument):
-    """Two on one domain and in one namespace: every frame has two commands, of which the plant obeys the first.
-
-    Recorder and plant say so; nothing leaves the mirror's stroke.
-    """
+    """On one domain and in one namespace: it is not activated, and every frame has one command."""
     session = instrument.status().session
     matrix = f"interaction_matrix:={instrument.folder / 'g.npz'}"
     second = instrument.start("hrtc", *CHANGES, "-p", matrix)
     end = time.monotonic() + PATIENCE
-    told: set[int] = set()
-    while len(told) < 2:
+    while "another HRTC is active in namespace /" not in second.output:
         assert time.monotonic() < end
         for transition in ("configure", "activate"):
             with suppress(OperatorError):  # the request goes to both; that of the first cannot
                 instrument.operator.transition(transition)
-        told |= {command.loop_state for command in instrument.commands[-20:] if command.session == session}
         instrument.spin(0.2)
     instrument.recorder_status(lambda status: status.command_publishers == 2)
-    instrument.spin(2.0)
-    assert all((np.abs(command.commands) <= LAYOUT.stroke.astype("f4")).all() for command in instrument.commands)
+    instrument.run(200)
     second.kill()
     instrument.recorder_status(lambda status: status.command_publishers == 1)
-    instrument.spin(0.5)
-    if instrument.status().loop_state != HrtcEvent.CLOSED:
-        instrument.operator.close_loop(True)
     instrument.assert_runs(session)
     report = instrument.end_recorder()
-    assert report["topics"]["/hrtc/command"]["duplicates"] > 50
+    assert report["topics"]["/hrtc/command"]["duplicates"] == 0
     instrument.start_recorder()
 
 
