@@ -473,7 +473,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         node.build()
         while not stop.is_set():
             executor.spin_once(timeout_sec=0.1)
-    except (InstrumentError, ValueError) as error:
+    except (InstrumentError, ValueError, MemoryError) as error:
         node.get_logger().error(str(error))
         return 2
     finally:

@@ -212,3 +212,13 @@ def test_what_runs_is_known_after_a_restart(loop: Loop, tmp_path: Path) -> None:
     implicit(other, label="learned", closures="none")[0].save(kept)
     srtc._recall(str(kept))
     assert "learned" not in srtc._built
+
+
+def test_what_does_not_fit_in_memory_is_refused_in_one_line(start_process: Any) -> None:
+    code = (
+        "import sys; from srtomo_srtc import memory, node; memory.available = lambda: 1e3; "
+        "sys.exit(node.main(['--ros-args', '-p', 'system:=mini']))"
+    )
+    srtc = start_process("-c", code)
+    assert srtc.wait(110) == 2, srtc.output
+    assert "GiB of memory" in srtc.output and "Traceback" not in srtc.output
