@@ -223,10 +223,12 @@ def fit(
     far = True
     for iteration in range(1, _ITERATIONS + 1):
         c, outer_scale, levels = theta[:n_layers], theta[n_layers] ** (-1 / _POWER), theta[n_layers + 1 :]
-        if not abs(math.log(outer_scale / at)) < _REBUILD:
+        moved = not abs(math.log(outer_scale / at)) < _REBUILD
+        if moved:
             at = outer_scale
             _build(layers, model, at)
-        if far or not abs(math.log(outer_scale / here)) < _RELINEARISE:
+        # what the layers lack of their sum is that of the layers as they are
+        if far or moved or not abs(math.log(outer_scale / here)) < _RELINEARISE:
             here = outer_scale
             of_layers = _total(layers, c)
             turbulence = of_layers if math.isclose(here, at) else model.turbulence(c, here)

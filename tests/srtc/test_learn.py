@@ -369,6 +369,14 @@ def test_what_is_told_is_the_best_that_these_frames_allow(system: System) -> Non
         assert stated == pytest.approx(sigma, rel=0.08)
 
 
+def test_a_fit_ends_whose_outer_scale_comes_and_goes(system: System) -> None:
+    # the layers are built anew on the way, and what they lack of their sum has to be theirs
+    layout = Layout(system)
+    model = SkyModel(system, layout, Sampling.of(system, layout, 2000), ALTITUDES * system.airmass)
+    told = learn(system, statistics(Night.of(system, model, 239).drawn(239, 300), 300), altitudes=ALTITUDES)
+    assert told.iterations < 10
+
+
 @pytest.mark.slow
 def test_1200_nights_are_calibrated(system: System) -> None:
     # of truths drawn far from the file's, how many lie within the stated 1-sigma interval; of 400 nights chance
