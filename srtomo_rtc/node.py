@@ -1,9 +1,10 @@
 """The HRTC as a ROS 2 lifecycle node: configure allocates, loads, locks and warms; activate runs.
 
-Three threads. The loop's thread waits for slopes, runs :class:`~srtomo_rtc.hrtc.Hrtc` and publishes commands. The
-executor's thread (main) serves lifecycle, parameters, services, status and events. One worker stages reconstructors.
-The executor and the worker never touch the loop's arrays: they post references and read counters. The loop's thread
-does not run in the interpreter (:mod:`srtomo_rtc.hot`).
+Four threads. The loop's thread waits for slopes, runs :class:`~srtomo_rtc.hrtc.Hrtc` and publishes commands. The
+executor's thread (main) serves lifecycle, parameters, services, status and events; it swaps and changes settings
+itself. Two workers, which never run at the loop's priority, take what may last a minute: one stages reconstructors, one
+writes files; only lifecycle transitions wait for them. None of them touches the loop's arrays: they post references and
+read counters. The loop's thread does not run in the interpreter (:mod:`srtomo_rtc.hot`).
 """
 
 from __future__ import annotations
@@ -48,6 +49,7 @@ from srtomo_core.reconstructor import Reconstructor, ReconstructorError, load_in
 from srtomo_core.ring import RingWriter, ring_path
 from srtomo_core.system import InstrumentError, load_system
 from srtomo_rtc.crew import MAX_THREADS, SPIN_NS, Crew, candidates, choose
+from srtomo_rtc.early_blocks import EarlyBlocks
 from srtomo_rtc.events import SCALARS, EventKind, change_fields, event_fields, state_fields
 from srtomo_rtc.hot import HotEndpoints, slopes_depth
 from srtomo_rtc.hrtc import Hrtc, Snapshot
@@ -114,7 +116,11 @@ _PARAMETERS: tuple[tuple[str, Any, ParameterDescriptor], ...] = (
     ("threads", 0, _integer("that share a product, the loop's included; 0: by measurement", 0, MAX_THREADS, True)),
     ("waiting", "auto", _read_only("how the compiled path waits: blocking, polling, or auto: by the cores there are")),
     ("cores", "", _read_only("cores of the loop's thread, as 2,3; with several threads one each; empty: any")),
-    ("fifo_priority", 0, _integer("SCHED_FIFO priority of the process; 0: normal scheduling", 0, 99, True)),
+    (
+        "fifo_priority",
+        0,
+        _integer("SCHED_FIFO priority of the process, but for what stages; 0: normal scheduling", 0, 99, True),
+    ),
     (
         "deadline",
         0.0,
@@ -185,8 +191,9 @@ class HrtcNode(LifecycleNode):
         self.create_timer(0.1, self._every_100_ms, clock=steady)
         self.create_timer(1.0, self._every_second, clock=steady)
         self._worker = ThreadPoolExecutor(max_workers=1, thread_name_prefix="staging")
+        self._files = ThreadPoolExecutor(max_workers=1, thread_name_prefix="files")
         self._manifest: Manifest | None = None
-        self._early_blocks: list[wire.ReconstructorBlock] = []
+        self._early_blocks = EarlyBlocks()
         self._last_block = 0.0
         self._resend_asked = 0.0
         self._kinds: dict[int, tuple[EventKind, str]] = {}
@@ -322,6 +329,7 @@ class HrtcNode(LifecycleNode):
             realtime.quiet_interpreter(),
             realtime.fifo_priority(self._value("fifo_priority")),
             *self._pin_helpers(),
+            self._set_workers_back(),
         ]
         for outcome in self._realtime:
             self._warn_of(outcome)
@@ -355,6 +363,11 @@ class HrtcNode(LifecycleNode):
     def _pin_helpers(self) -> list[realtime.Outcome]:
         helpers = self._crew.helpers if self._crew is not None else ()
         return [realtime.pin_helpers(helpers, self._cores)] if helpers else []
+
+    def _set_workers_back(self) -> realtime.Outcome:
+        """After SCHED_FIFO: a thread has the priority of the one that started it, or that of all when that was set."""
+        outcomes = [pool.submit(realtime.stand_back, self._cores).result() for pool in (self._worker, self._files)]
+        return next((outcome for outcome in outcomes if not outcome.applied), outcomes[0])
 
     def _load_first(self) -> None:
         """Start from the file of parameter ``reconstructor``, or else from the last one committed."""
@@ -457,7 +470,8 @@ class HrtcNode(LifecycleNode):
 
     def _clean_up(self) -> None:
         self.stop_loop()
-        self._worker.submit(lambda: None).result()
+        for pool in (self._worker, self._files):
+            pool.submit(lambda: None).result()
         if self._hot is not None:
             self._hot.destroy()
         self._end_crew()
@@ -478,6 +492,7 @@ class HrtcNode(LifecycleNode):
         self.stop_loop()
         self._end_crew()
         self._worker.shutdown(wait=True)
+        self._files.shutdown(wait=True)
         if self._hot is not None:
             self._hot.destroy()
             self._hot = None
@@ -510,7 +525,7 @@ class HrtcNode(LifecycleNode):
     # -- reconstructors on the wire ---------------------------------------------------------------------------------
 
     def _on_manifest(self, message: Any) -> None:
-        self._manifest = Manifest(
+        manifest = Manifest(
             sha256=bytes(message.sha256),
             fingerprint=bytes(message.fingerprint),
             n_commands=message.n_commands,
@@ -527,28 +542,28 @@ class HrtcNode(LifecycleNode):
             low_order_commands=np.array(message.low_order_commands, np.float32),
             low_order_slopes=np.array(message.low_order_slopes, np.float32),
         )
-        if message.id != self._manifest.id:
-            self._refuse(self._manifest, "id is not the first 8 bytes of sha256")
-        elif self._swap is not None:
-            self._begin(self._manifest)
+        if message.id != manifest.id:
+            self._refuse(manifest, "id is not the first 8 bytes of sha256")
+            return
+        self._manifest = manifest
+        if self._swap is not None:
+            self._begin(manifest)
 
     def _begin(self, manifest: Manifest) -> None:
         swap = self._swap
         assert swap is not None
 
         def begin() -> None:
+            self._last_block = time.monotonic()
             # asked on the worker's thread: the same one may be just being staged
-            known = (swap.active, swap.staged)
-            if any(held is not None and held.slot.sha256 == manifest.sha256 for held in known):
+            if swap.holds(manifest.sha256):
                 swap.forget()  # a late repetition of what is here already
             else:
                 swap.begin(manifest)
 
-        self._last_block = self._resend_asked = time.monotonic()
         self._watch(self._worker.submit(begin), manifest)
-        for block in self._early_blocks:
+        for block in self._early_blocks.take(manifest.sha256):
             self._take(block)
-        self._early_blocks.clear()
 
     def _on_block(self, data: bytes) -> None:
         try:
@@ -557,21 +572,16 @@ class HrtcNode(LifecycleNode):
             self.get_logger().warning(f"srtc/reconstructor_block: {error}")
             return
         if self._swap is None or self._manifest is None or block.sha256 != self._manifest.sha256:
-            # blocks and manifest are two topics: a block may come before its manifest
-            # of two reconstructors at most: there may be nobody yet to use them
-            kept = {block.sha256, self._manifest.sha256 if self._manifest is not None else b""}
-            if self._early_blocks and self._early_blocks[-1].sha256 != block.sha256:
-                self._early_blocks = [other for other in self._early_blocks if other.sha256 in kept]
-            self._early_blocks.append(block)
+            self._early_blocks.keep(block, self._manifest.sha256 if self._manifest is not None else None)
             return
         self._take(block)
 
     def _take(self, block: wire.ReconstructorBlock) -> None:
         swap, manifest = self._swap, self._manifest
         assert swap is not None and manifest is not None
-        self._last_block = time.monotonic()
 
         def take() -> None:
+            self._last_block = time.monotonic()  # not when it came: it may have waited for a long stage
             if swap.take(block):
                 held = swap.stage()
                 self._event(
@@ -600,17 +610,21 @@ class HrtcNode(LifecycleNode):
         self._event(EventKind.REFUSED, reason, manifest.sha256)
 
     def _ask_again(self) -> None:
-        missing = self._swap.missing if self._swap is not None else None
-        if missing is None:
+        swap, manifest = self._swap, self._manifest
+        missing = swap.missing if swap is not None else None
+        if swap is None or manifest is None or missing is None or missing[0] != manifest.id:
             return
         now = time.monotonic()
         identity, blocks = missing
         if now - self._last_block > _GIVE_UP_AFTER:
-            manifest = self._manifest
+
+            def give_up() -> None:
+                if swap.missing is not None:  # nothing has come in the meantime
+                    swap.forget()
+                    raise Refused(f"{len(blocks)} of {manifest.n_blocks} blocks never came")
+
             self._manifest = None
-            assert self._swap is not None and manifest is not None
-            self._worker.submit(self._swap.forget).result()
-            self._refuse(manifest, f"{len(blocks)} of {manifest.n_blocks} blocks never came")
+            self._watch(self._worker.submit(give_up), manifest)
         elif now - max(self._last_block, self._resend_asked) > _RESEND_AFTER and self._resend.service_is_ready():
             self._resend_asked = now
             self._resend.call_async(PublishReconstructor.Request(id=identity, blocks=blocks))
@@ -672,7 +686,7 @@ class HrtcNode(LifecycleNode):
             return response
         action = swap.commit if kind is EventKind.COMMIT else swap.roll_back
         try:
-            program = self._worker.submit(action, request.id, bytes(request.sha256)).result()
+            program = action(request.id, bytes(request.sha256))
         except Refused as error:
             self._event(EventKind.REFUSED, str(error), bytes(request.sha256))
             response.message = str(error)
@@ -700,7 +714,7 @@ class HrtcNode(LifecycleNode):
                 response.message = f"{name}: expected {count} finite values, got {len(values)}"
                 return response
             pair[name] = array
-        program = self._worker.submit(lambda: swap.change_settings(**pair)).result()
+        program = swap.change_settings(**pair)
         response.settings = swap.settings.id
         if program is None:
             response.success, response.message = True, "taken up with the first reconstructor"
@@ -722,7 +736,7 @@ class HrtcNode(LifecycleNode):
             return response
         those = sum(1 << names.index(name) for name in set(request.sensors))
         closed = swap.settings.closed_sensors | those if request.closed else swap.settings.closed_sensors & ~those
-        program = self._worker.submit(lambda: swap.change_settings(closed_sensors=closed)).result()
+        program = swap.change_settings(closed_sensors=closed)
         response.closed_sensors = closed
         text = f"sensors closed: {', '.join(self._closed_names()) or 'none'}"
         if program is None:
@@ -772,7 +786,7 @@ class HrtcNode(LifecycleNode):
                 if (error := done.exception()) is not None:
                     self.get_logger().error(f"{path}: the committed reconstructor was not kept ({error})")
 
-            self._worker.submit(self._swap.save_active, path).add_done_callback(report)
+            self._files.submit(self._swap.save_active, path).add_done_callback(report)
 
     # -- parameters -------------------------------------------------------------------------------------------------
 
@@ -780,7 +794,7 @@ class HrtcNode(LifecycleNode):
         swap = self._swap
         changes = {p.name: p.value for p in parameters if p.name in SCALARS}
         if swap is not None and changes:
-            program = self._worker.submit(lambda: swap.change_settings(**changes)).result()
+            program = swap.change_settings(**changes)
             text = ", ".join(f"{name} = {value}" for name, value in changes.items())
             if program is None:
                 self._event(EventKind.SETTINGS, text)

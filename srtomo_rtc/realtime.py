@@ -19,6 +19,7 @@ _BLAS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NU
 _BLAS_COUNTS = tuple(
     f"{prefix}openblas_get_num_threads{suffix}" for prefix in ("", "scipy_") for suffix in ("", "64_", "_64_")
 )  # as the wheels of numpy and scipy, and distributions, name it
+_REAL_TIME = (os.SCHED_FIFO, os.SCHED_RR)
 _MCL_CURRENT, _MCL_FUTURE = 1, 2
 
 HUGE_PAGE = 2 << 20
@@ -177,6 +178,25 @@ def fifo_priority(priority: int) -> Outcome:
     except (OSError, ValueError) as error:
         return Outcome(name, False, f"{error} (RLIMIT_RTPRIO)")
     return Outcome(name, found == {(os.SCHED_FIFO, priority)}, str(priority))
+
+
+def stand_back(cores: Collection[int]) -> Outcome:
+    """Normal scheduling for the calling thread, and none of ``cores`` if others remain to the process.
+
+    For work of seconds, which the loop could not preempt at its own priority. No less than normal: whoever has the
+    interpreter's lock must get on.
+    """
+    name = "staging"
+    try:
+        if os.sched_getscheduler(0) in _REAL_TIME:
+            os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+    except OSError as error:
+        return Outcome(name, False, str(error))
+    if os.sched_getscheduler(0) in _REAL_TIME:
+        return Outcome(name, False, "it has kept the loop's scheduling")
+    allowed = os.sched_getaffinity(os.getpid())
+    pinned = pin_thread(allowed.difference(cores) or allowed, name=name)
+    return pinned._replace(detail=f"normal scheduling, {pinned.detail}") if pinned.applied else pinned
 
 
 def quiet_interpreter() -> Outcome:

@@ -1,17 +1,22 @@
 """Stage, check, warm and commit a reconstructor; all of it off the loop's thread.
 
 A reconstructor comes as a manifest and row blocks. Shapes are checked against the instrument before memory is touched;
-when the last row is in, the whole is checked (:meth:`Swap.check`), copied into the slot that the loop does not use, and
+when the last row is in, the whole is checked (:func:`check`), copied into a slot that the loop does not use, and
 touched until warm. Nothing reaches the loop before :meth:`Swap.commit`, which posts one reference. There are three
 slots: active, staged and previous.
 
-Threads: one thread at a time, any but the loop's, calls everything here; the node has a worker for it. Attributes and
-``missing`` may be read from any thread.
+Threads: two at a time, neither of them the loop's. One transfers and stages (``begin``, ``take``, ``forget``,
+``stage``, ``stage_whole``, ``scratch``), which may take a minute. The other says what the loop runs (``commit``,
+``roll_back``, ``change_settings``), and never waits for that: the lock that is between them is held while slots change
+hands, and while a :class:`~srtomo_rtc.loop.Program` is made, but not while one is checked, filled or warmed for
+staging. A slot that is being filled is in nobody's hands: it cannot be committed or rolled back to. ``holds`` and
+``save_active`` may be called, attributes and ``missing`` read, from any thread.
 """
 
 from __future__ import annotations
 
 import math
+import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -397,6 +402,7 @@ class Swap:
         self._Q = np.zeros((n_parts(max_epochs), layout.n_commands, layout.n_commands), np.float32)
         self._table: list[tuple[int, int, int, int]] = []
         self._waiting: frozenset[int] = frozenset()
+        self._lock = threading.Lock()  # of the attributes below
         self.settings = settings
         self.active: Held | None = None
         self.staged: Held | None = None
@@ -519,25 +525,34 @@ class Swap:
         elif self._kernel == "tlr":
             factors, compression = self._factorise(reconstructor)
             result = replace(result, compression=compression)
-        slot = self._free()
+        slot = self._reserve()
         slot.fill(reconstructor, factors)
+        # with the settings of now: those of the commit may be others, but every matrix was just written
         Program(slot, self.settings).warm()
-        self.staged = Held(slot, result, reconstructor)
-        return self.staged
+        held = Held(slot, result, reconstructor)
+        with self._lock:
+            self.staged = held
+        return held
 
-    def _free(self) -> Slot:
-        in_use = {id(held.slot) for held in (self.active, self.previous) if held is not None}
-        return next(slot for slot in self._slots if id(slot) not in in_use)
+    def _reserve(self) -> Slot:
+        """A slot that neither the loop nor a roll-back uses, nor a commit from now on: nothing is staged in it."""
+        with self._lock:
+            in_use = {id(held.slot) for held in (self.active, self.previous) if held is not None}
+            free = [slot for slot in self._slots if id(slot) not in in_use]
+            staged = None if self.staged is None else self.staged.slot
+            slot = next((one for one in free if one is not staged), free[0])
+            if slot is staged:
+                self.staged = None
+        return slot
 
     def scratch(self) -> tuple[NDArray[Any], ...]:
         """R's tiles of a slot that the loop does not use, to measure with; what was staged in it is lost.
 
         For low rank, which has none before there are factors, new ones of 16 bits: an upper bound.
         """
-        self.staged = None
         if self._kernel == "tlr":
             return Matrices(self._layout, "int16").R_tiles
-        return self._free().epochs[0].R_tiles
+        return self._reserve().epochs[0].R_tiles
 
     def matrices(self) -> list[tuple[int, int]]:
         """Address and bytes of each of the matrices of all slots."""
@@ -619,10 +634,16 @@ class Swap:
 
     def save_active(self, path: str) -> None:
         """Write the active reconstructor to a file, for a restart."""
-        if self.active is not None:
-            self.active.reconstructor.save(path)
+        active = self.active
+        if active is not None:
+            active.reconstructor.save(path)
 
     # -- what the loop runs -----------------------------------------------------------------------------------------
+
+    def holds(self, sha256: bytes) -> bool:
+        """Whether the reconstructor with this SHA-256 is active or staged."""
+        with self._lock:
+            return any(held is not None and held.slot.sha256 == sha256 for held in (self.active, self.staged))
 
     def commit(self, identity: int, sha256: bytes) -> Program:
         """Post the staged reconstructor to the loop; the active one becomes the previous.
@@ -630,8 +651,9 @@ class Swap:
         Raises:
             Refused: nothing is staged under that id and SHA-256.
         """
-        program = self._run(self.staged, identity, sha256, "staged")
-        self.previous, self.active, self.staged = self.active, self.staged, None
+        with self._lock:
+            program = self._run(self.staged, identity, sha256, "staged")
+            self.previous, self.active, self.staged = self.active, self.staged, None
         return program
 
     def roll_back(self, identity: int, sha256: bytes) -> Program:
@@ -640,8 +662,9 @@ class Swap:
         Raises:
             Refused: the previous one does not have that id and SHA-256.
         """
-        program = self._run(self.previous, identity, sha256, "kept as the previous one")
-        self.previous, self.active = self.active, self.previous
+        with self._lock:
+            program = self._run(self.previous, identity, sha256, "kept as the previous one")
+            self.previous, self.active = self.active, self.previous
         return program
 
     def _run(self, held: Held | None, identity: int, sha256: bytes, where: str) -> Program:
@@ -657,11 +680,12 @@ class Swap:
 
     def change_settings(self, **changes: object) -> Program | None:
         """New settings, under a new id, from the next frame on; None while no reconstructor is active."""
-        self.settings = replace(self.settings, id=self.settings.id + 1, **changes)  # type: ignore[arg-type]
-        if self.active is None:
-            return None
-        program = Program(self.active.slot, self.settings)
-        if "closed_sensors" in changes:
-            program.warm()
-        self._post(program)
+        with self._lock:
+            self.settings = replace(self.settings, id=self.settings.id + 1, **changes)  # type: ignore[arg-type]
+            if self.active is None:
+                return None
+            program = Program(self.active.slot, self.settings)
+            if "closed_sensors" in changes:
+                program.warm()
+            self._post(program)
         return program

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import time
 from collections.abc import Sequence
@@ -43,6 +44,22 @@ HELD = {
     "held_behind": Verdict.HOLD_BEHIND,
     "held_history": Verdict.HOLD_HISTORY,
 }
+
+# An HRTC whose check of a reconstructor labelled "long" takes until a file is there.
+LONG_CHECK = """
+import sys, threading, time
+from pathlib import Path
+from srtomo_rtc import node, swap
+whole = swap.check
+def check(reconstructor, *arguments):
+    if reconstructor.label == "long":
+        print(f"staging on thread {threading.get_native_id()}.", flush=True)
+        while not Path(sys.argv[1]).exists():
+            time.sleep(0.01)
+    return whole(reconstructor, *arguments)
+swap.check = check
+sys.exit(node.main(sys.argv[sys.argv.index("--ros-args") :]))
+"""
 
 
 class Wire:
@@ -576,6 +593,59 @@ def test_a_matrix_that_is_sent_twice(loop, mini, helpers):
     loop.until(all_told)
     assert staged == [other.id, mini.b.id]
     assert loop.status().reconstructors_refused == refused
+
+
+@pytest.fixture(scope="module")
+def staging(start, wired, first_matrix, mini, helpers, tmp_path_factory):
+    """A closed loop beside a check that goes on until ``done`` is there; the HRTC is asked for SCHED_FIFO."""
+    done = tmp_path_factory.mktemp("staging") / "done"
+    core = min(os.sched_getaffinity(0))
+    parameters = f"reconstructor:={first_matrix}", "fifo_priority:=5", f"cores:='{core}'", "threads:=1"
+    process = start("staging", *parameters, first=("-c", LONG_CHECK, str(done)))
+    made = wired("staging")
+    made.operator.close_loop(True)
+    made.run(5)
+    long = replace(mini.b, label="long")
+    made.publish(helpers.manifest_of(long), helpers.blocks_of(long))
+    process.wait_for("staging on thread")
+    (thread,) = re.findall(r"staging on thread (\d+)\.", process.output)
+    yield SimpleNamespace(wire=made, process=process, thread=int(thread), core=core, done=done, long=long)
+    done.touch()
+    assert process.terminate() == 0, process.output
+
+
+def test_nobody_waits_for_a_long_check(staging):
+    """Services, parameters and status answer, frames go on; in the end it is staged and can be committed."""
+    made = staging.wire
+    sensor = made.layout.sensors[0].name
+    with pytest.raises(OperatorError, match="no reconstructor is staged"):
+        made.operator.commit(staging.long.id, staging.long.sha256)
+    with pytest.raises(OperatorError, match="no reconstructor is kept as the previous one"):
+        made.operator.commit(staging.long.id, staging.long.sha256, roll_back=True)
+    first, _ = made.operator.close_sensors([sensor], True)
+    assert first == made.next
+    assert made.run(3) == [Verdict.HOLD_CLOSED] * 3
+    made.operator.close_sensors([sensor], False)
+    made.operator.change_parameters({"leak": "0.01"})
+    assert made.run(3) == [Verdict.OK] * 3
+    made.operator.flatten()
+    assert (made.status().loop_state, made.status().staged) == (HrtcEvent.FLAT, 0)
+    staging.done.touch()
+    made.status(lambda status: status.staged == staging.long.id)
+    made.operator.commit(staging.long.id, staging.long.sha256)
+    made.run(3)
+    assert (made.commands[-1].reconstructor, made.status().previous) == (staging.long.id, made.mini.a.id)
+
+
+def test_what_stages_does_not_run_at_the_loops_priority(staging):
+    realtime = staging.wire.status().realtime
+    if "SCHED_FIFO 5" not in realtime:
+        pytest.skip("the system refuses SCHED_FIFO (RLIMIT_RTPRIO)")
+    assert os.sched_getscheduler(staging.process.pid) == os.SCHED_FIFO
+    assert os.sched_getscheduler(staging.thread) == os.SCHED_OTHER
+    others = os.sched_getaffinity(0) - {staging.core} or {staging.core}
+    assert os.sched_getaffinity(staging.thread) == others
+    assert f"staging normal scheduling, cores {','.join(map(str, sorted(others)))}" in realtime
 
 
 @pytest.mark.slow

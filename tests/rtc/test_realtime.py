@@ -118,3 +118,24 @@ def test_the_interpreter_is_quiet():
         "print(gc.get_freeze_count() > 1000, sys.getswitchinterval())"
     )
     assert run(code).splitlines() == ["garbage collection frozen", "True 0.0005"]
+
+
+def test_a_worker_stands_back():
+    """A thread that is started under SCHED_FIFO, on all cores, gets off both."""
+    allowed = sorted(os.sched_getaffinity(0))
+    code = (
+        "import os, threading; from srtomo_rtc import realtime; fifo = realtime.fifo_priority(5).applied;"
+        "worker = lambda: print(os.sched_getscheduler(0), realtime.stand_back({}), os.sched_getscheduler(0),"
+        " os.sched_getaffinity(0), sep='; '); started = threading.Thread(target=worker); started.start();"
+        "started.join(); print(fifo, os.sched_getscheduler(0), os.sched_getaffinity(0), sep='; ')"
+    )
+    for taken in (allowed[:1], allowed, []):
+        worker, rest = run(code.format(taken)).splitlines()
+        left = [core for core in allowed if core not in taken] or allowed
+        fifo = rest.startswith("True")
+        policy = os.SCHED_FIFO if fifo else os.SCHED_OTHER
+        cores = ",".join(map(str, left))
+        assert worker == f"{policy}; staging normal scheduling, cores {cores}; {os.SCHED_OTHER}; {set(left)}"
+        assert rest == f"{fifo}; {policy}; {set(allowed)}"
+    if not fifo:
+        pytest.skip("the system refuses SCHED_FIFO (RLIMIT_RTPRIO): nothing to be taken off")

@@ -2,6 +2,9 @@
 
 import math
 import random
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import cache
 
@@ -10,6 +13,7 @@ import pytest
 
 from srtomo_core.layout import Layout
 from srtomo_core.reconstructor import Reconstructor
+from srtomo_rtc import swap as swap_module
 from srtomo_rtc.loop import Loop, Program, Slot, Verdict
 from srtomo_rtc.swap import Refused, Swap, check, smooth_shapes, spectral_radius
 from srtomo_sim.mirror import interaction_matrix
@@ -452,6 +456,123 @@ def test_staging_never_touches_a_slot_in_use(bench_with_a, mini):
         assert len({id(held.slot) for held in (swap.active, swap.staged, swap.previous)}) == 3
         assert np.array_equal(swap.active.slot.epochs[0].Q, mini.b.Q[0])
         assert np.array_equal(swap.previous.slot.epochs[0].Q, mini.a.Q[0])
+
+
+@contextmanager
+def staging(swap, reconstructor):
+    """Stages on another thread meanwhile; the result is there at the end."""
+    with ThreadPoolExecutor(1) as worker:
+        staged = worker.submit(swap.stage_whole, reconstructor)
+        yield staged
+        assert staged.result(timeout=30).reconstructor is reconstructor
+
+
+@pytest.fixture
+def held_up(monkeypatch):
+    """Holds a function up: (it was entered, it may go on)."""
+
+    @contextmanager
+    def hold(owner, name):
+        entered, go_on, whole = threading.Event(), threading.Event(), getattr(owner, name)
+
+        def held(*args, **options):
+            entered.set()
+            assert go_on.wait(30)
+            return whole(*args, **options)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(owner, name, held)
+            yield entered, go_on
+
+    return hold
+
+
+def test_what_runs_changes_while_a_check_takes_its_time(bench_with_a, mini, held_up):
+    """A commit, a roll-back and settings; then it is staged beside what is active and previous by then."""
+    made, swap = bench_with_a, bench_with_a.swap
+    swap.stage_whole(mini.b)
+    other = built(mini, mini.a.R[0] * 1.1)
+    with held_up(swap_module, "check") as (entered, go_on), staging(swap, other):
+        try:
+            assert entered.wait(30)
+            swap.commit(mini.b.id, mini.b.sha256)
+            made.run(range(10, 12))
+            swap.roll_back(mini.a.id, mini.a.sha256)
+            made.run(range(12, 14))
+            swap.change_settings(leak=0.25)
+            assert swap.staged is None and swap.holds(mini.a.sha256) and not swap.holds(other.sha256)
+        finally:
+            go_on.set()
+    assert [held.slot.id for held in (swap.active, swap.previous, swap.staged)] == [mini.a.id, mini.b.id, other.id]
+    assert len({id(held.slot) for held in (swap.active, swap.previous, swap.staged)}) == 3
+    assert np.array_equal(swap.previous.slot.epochs[0].Q, mini.b.Q[0])
+    made.run(range(14, 16))
+    assert swap.commit(other.id, other.sha256).settings.leak == 0.25
+
+
+def test_a_slot_that_is_being_filled_is_in_nobodys_hands(bench_with_a, mini, held_up):
+    """What was staged in it cannot be committed any more; all else can be done."""
+    made, swap = bench_with_a, bench_with_a.swap
+    swap.stage_whole(mini.b)
+    swap.commit(mini.b.id, mini.b.sha256)
+    made.run(range(10, 12))
+    old, new = (built(mini, mini.a.R[0] * factor) for factor in (0.9, 1.1))
+    swap.stage_whole(old)
+    with held_up(Slot, "fill") as (entered, go_on), staging(swap, new):
+        try:
+            assert entered.wait(30)
+            with pytest.raises(Refused, match="no reconstructor is staged"):
+                swap.commit(old.id, old.sha256)
+            swap.roll_back(mini.a.id, mini.a.sha256)
+            made.run(range(12, 14))
+        finally:
+            go_on.set()
+    assert [held.slot.id for held in (swap.active, swap.previous, swap.staged)] == [mini.a.id, mini.b.id, new.id]
+    assert np.array_equal(swap.staged.slot.epochs[0].Q, new.Q[0])
+
+
+def test_one_thread_stages_while_another_swaps(bench, mini):
+    """As fast as both go; no command is of a mixture, and whatever is in a slot is whole."""
+    made = bench()
+    made.close(mini.a)
+    variants = [built(mini, mini.a.R[0] * (0.9 + 0.02 * i), label=str(i)) for i in range(8)]
+    by_id = {one.id: one for one in (mini.a, *variants)}
+    stop, n_staged, choices = threading.Event(), 0, random.Random(3)
+
+    def stage() -> None:
+        nonlocal n_staged
+        while not stop.is_set():
+            made.swap.stage_whole(variants[n_staged % len(variants)])
+            n_staged += 1
+
+    made.run(range(5))
+    state, swaps = made.hrtc.loop.state.astype(float), 0
+    with ThreadPoolExecutor(1) as worker:
+        stager = worker.submit(stage)
+        try:
+            for k in range(5, 200):
+                slopes, shown = made.sky.slopes(k), made.sky.shown[k - 2]
+                parts = made.messages(k)
+                made.offer(*parts[:2])
+                held = choices.choice((made.swap.staged, made.swap.staged, made.swap.previous))
+                act = made.swap.roll_back if held is made.swap.previous else made.swap.commit
+                if held is not None:
+                    with suppress(Refused):  # not any more
+                        act(held.reconstructor.id, held.reconstructor.sha256)
+                        swaps += 1
+                one = made.swap.active
+                assert np.array_equal(one.slot.epochs[0].R, one.reconstructor.R[0])
+                assert np.array_equal(one.slot.epochs[0].Q, one.reconstructor.Q[0])
+                made.offer(*parts[2:])
+                command = made.commands[-1]
+                one = by_id[command.reconstructor]
+                expected = 0.5 * state + 0.5 * (one.Q[0].astype(float) @ shown + one.R[0].astype(float) @ slopes)
+                assert command.commands == pytest.approx(expected, abs=3e-5 * np.abs(expected).max())
+                state = command.commands.astype(float)
+        finally:
+            stop.set()
+        stager.result(timeout=30)
+    assert swaps > 20 and n_staged > 5
 
 
 def test_settings_go_with_whatever_is_active(bench_with_a, mini):
