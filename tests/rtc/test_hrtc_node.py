@@ -164,7 +164,8 @@ def finished(ros, start_hrtc, start_shared_process, others, folder):
         *("-m", "srtomo_sim.node", "--ros-args", "-p", "system:=mini", "-p", "pace:=lockstep"),
         *("-p", f"frames:={FRAMES}", "-p", f"seed:={SEED}", "-p", f"result:={folder / 'result.npz'}"),
     )
-    operator, listener = Operator(), Listener()
+    # six processes start at once
+    operator, listener = Operator(patience=90.0), Listener()
     reconstructors: dict[bytes, Reconstructor] = {}
     said: dict[str, Any] = {}
 
