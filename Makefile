@@ -13,6 +13,7 @@ help:
 	@echo 'make test [ARGS=...]   run the tests; test-slow: the long ones'
 	@echo 'make rival             install pyTomoAO and pyRTC into build, and time the same work against them'
 	@echo 'make soak              a million frames of gnao_ltao_sr with swaps and faults, each checked: 40 minutes at most'
+	@echo 'make sanitize          run the frame path in C under address, undefined-behaviour and thread sanitizers'
 	@echo 'make lint              ruff and mypy'
 	@echo 'make install           only install into $(VENV), as all of the above do first'
 	@echo 'make clean             remove $(VENV) and what the tools left'
@@ -39,7 +40,26 @@ rival: install
 		$(BIN)/python -m pytest -m slow tests/ops/test_rival_pyrtc.py $(ARGS)
 
 soak: install
-	$(BIN)/srtomo bench soak gnao_ltao_sr --json soak.json $(ARGS)
+	@timeout --foreground --signal=INT --kill-after=120 2400 \
+		$(BIN)/srtomo bench soak gnao_ltao_sr --json soak.json $(ARGS) || { status=$$?; \
+		[ $$status != 124 ] || echo 'make soak: not done after 40 minutes, which is all it may take'; exit $$status; }
+
+# A build of its own for each, which Python loads instead of the installed one. Python itself is not instrumented, so the
+# sanitizer's library has to be loaded first, and what Python never frees is no leak. Reports go past pytest's capture.
+SANITIZED := $(patsubst %,tests/rtc/test_%.py,closed_sensors crew faults hrtc latency limits loop lowrank \
+	ring_from_c several_exposures threads tip_tilt vmm)
+sanitize: install build/sanitize/address/libsrtomo_frame.so build/sanitize/thread/libsrtomo_frame.so
+	SRTOMO_FRAME_PATH=$(CURDIR)/build/sanitize/address LD_PRELOAD=$$(gcc -print-file-name=libasan.so) \
+		ASAN_OPTIONS=detect_leaks=0 $(BIN)/python -m pytest --capture=sys $(SANITIZED)
+	SRTOMO_FRAME_PATH=$(CURDIR)/build/sanitize/thread LD_PRELOAD=$$(gcc -print-file-name=libtsan.so) \
+		TSAN_OPTIONS=exitcode=66 $(BIN)/python -m pytest --capture=sys tests/rtc/test_crew.py tests/rtc/test_threads.py
+
+build/sanitize/address/libsrtomo_frame.so: SANITIZER := -fsanitize=address,undefined -fno-sanitize-recover=undefined
+build/sanitize/thread/libsrtomo_frame.so: SANITIZER := -fsanitize=thread -Wno-tsan
+build/sanitize/%/libsrtomo_frame.so: $(wildcard srtomo_rtc/native/*.[ch])
+	mkdir -p $(@D)
+	gcc -std=gnu11 -g -O2 -fno-omit-frame-pointer -ffp-contract=off $(SANITIZER) -shared -fPIC -pthread \
+		$(filter-out %/ros.c,$(filter %.c,$^)) -lm -o $@
 
 lint: install
 	$(BIN)/ruff check .
@@ -74,4 +94,4 @@ $(STAMP): pyproject.toml $(shell find msgs_schema srtomo_rtc/native) $(if $(filt
 	@echo ' done'; echo '$(PYTHON)' >$@
 
 FORCE:
-.PHONY: help demo test test-slow rival soak lint clean missing install FORCE
+.PHONY: help demo test test-slow rival soak sanitize lint clean missing install FORCE

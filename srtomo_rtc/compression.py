@@ -1,4 +1,7 @@
-"""What a compressed R costs, against what the sensors' noise costs anyway."""
+"""What a compressed R costs, against what the sensors' noise costs anyway.
+
+Any thread may call any of these but the loop's, which they would hold up.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""What the HRTC tells of itself, as plain fields of HrtcEvent and HrtcState: enough for an exact replay. No ROS."""
+"""What the HRTC tells of itself, as plain fields of HrtcEvent and HrtcState: enough for an exact replay. No ROS.
+
+Any thread may call any of these: they read what no longer changes.
+"""
 
 from __future__ import annotations
 

@@ -1,12 +1,14 @@
 """The frame path's C library (``native/``), as ctypes sees it: structures and signatures, nothing else.
 
 The structures mirror ``native/frame.h`` and ``native/ros.c``; loading compares their sizes. Calls release the
-interpreter.
+interpreter; which thread may make them is said where they are declared and in the classes that wrap them. Any thread
+may load and make views. SRTOMO_FRAME_PATH is a folder to load from instead: ``make sanitize`` has its own build there.
 """
 
 from __future__ import annotations
 
 import ctypes
+import os
 import sysconfig
 from ctypes import (
     POINTER,
@@ -362,7 +364,7 @@ _ROS_FUNCTIONS: dict[str, tuple[Any, tuple[Any, ...]]] = {
 
 
 def _load(name: str, functions: dict[str, tuple[Any, tuple[Any, ...]]]) -> ctypes.CDLL:
-    path = Path(sysconfig.get_path("data"), "lib", name)
+    path = Path(os.environ.get("SRTOMO_FRAME_PATH") or Path(sysconfig.get_path("data"), "lib"), name)
     try:
         library = ctypes.CDLL(str(path))
         for function, (result, arguments) in functions.items():

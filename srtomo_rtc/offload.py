@@ -1,6 +1,7 @@
 """Tip and tilt that the mirrors take off, for the telescope to take over. No ROS, and not on the hot path.
 
 From the commands that the loop remembers: what a telescope's control offloads is their mean over a second, not a frame.
+Any thread but the loop's may call these; what the loop remembers is only read.
 """
 
 from __future__ import annotations

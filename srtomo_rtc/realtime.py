@@ -1,6 +1,8 @@
 """Real-time settings: each one applied, read back, and reported with the reason where the system refused.
 
 Import this module first: :func:`pin_blas` must run before numpy loads, and :func:`read_blas` after it.
+:func:`pin_thread` and :func:`kept_on` may act on the thread that calls them; everything else is of the whole process or
+of threads named, and for one thread to call before frames come.
 """
 
 from __future__ import annotations

@@ -5,6 +5,8 @@ every multiplication and every addition. No order depends on a vector width or o
 no multiply-add is fused, so a kernel gives the same bits on every machine: replays and golden bags rely on that.
 A matrix is held in tiles of rows, whose sums stay in registers while the columns go by.
 :func:`multiply_int16` reads half the memory: 16-bit integers with one float32 scale a row.
+
+Any thread may call any of these, each with output of its own.
 """
 
 from __future__ import annotations

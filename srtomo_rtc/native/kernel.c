@@ -4,7 +4,8 @@
 
 /* One source for every machine: the loader picks the widest vectors that the processor has. The file is compiled with
  * -ffp-contract=off, since a fused multiply-add keeps bits that not every machine would have. */
-#if defined(__x86_64__) && defined(__GNUC__) && !defined(__clang__) && !defined(__SANITIZE_ADDRESS__)
+#if defined(__x86_64__) && defined(__GNUC__) && !defined(__clang__) && !defined(__SANITIZE_ADDRESS__) && \
+    !defined(__SANITIZE_THREAD__)
 #define WIDEST __attribute__((target_clones("avx512f", "avx2", "default")))
 #else
 #define WIDEST
