@@ -408,6 +408,8 @@ class SimNode(Node):
             source="plant",
             r0=atmosphere.r0,
             outer_scale=atmosphere.outer_scale,
+            outer_scale_low=atmosphere.outer_scale,
+            outer_scale_high=atmosphere.outer_scale,
             altitude=[layer.altitude for layer in atmosphere.layers],
             fraction=list(atmosphere.fractions),
             wind_speed=[layer.wind_speed for layer in atmosphere.layers],

@@ -24,7 +24,8 @@ def believed_fields(system: System) -> dict[str, Any]:
         "wind_speed": [layer.wind_speed for layer in atmosphere.layers],
         "wind_direction": [layer.wind_direction for layer in atmosphere.layers],
         "r0_error": math.nan,
-        "log_outer_scale_error": math.nan,
+        "outer_scale_low": math.nan,
+        "outer_scale_high": math.nan,
         **{
             f"{name}_error": [math.nan] * len(atmosphere.layers)
             for name in ("fraction", "wind_speed", "wind_direction")
@@ -34,8 +35,6 @@ def believed_fields(system: System) -> dict[str, Any]:
 
 def learned_fields(system: System, sky: LearnedSky, window: Statistics) -> dict[str, Any]:
     """Fields of an AtmosphereProfile for what was learned from a window: a layer for each group that can be told.
-
-    Of an outer scale that is not seen the lower limit is in the text: its error can have two sides only.
 
     Args:
         system: the instrument; its winds are supposed where none were learned.
@@ -52,7 +51,6 @@ def learned_fields(system: System, sky: LearnedSky, window: Statistics) -> dict[
     for level in learned.noise:
         rms = math.sqrt(level.factor)
         noise[:, level.sensor] = rms, level.sigma / (2 * rms)
-    unseen = [] if math.isfinite(high) else [f"outer scale above {low:.0f} m"]
     return {
         "r0": learned.r0,
         "outer_scale": learned.outer_scale,
@@ -66,15 +64,14 @@ def learned_fields(system: System, sky: LearnedSky, window: Statistics) -> dict[
         "n_frames": learned.n_frames,
         "n_effective": learned.n_effective,
         "r0_error": learned.r0_sigma,
-        "log_outer_scale_error": math.log(high / low) / 2 if math.isfinite(high) else math.nan,
+        "outer_scale_low": low,
+        "outer_scale_high": high,
         "fraction_error": [group.sigma for group in groups],
         "wind_speed_error": wind_error.tolist(),
         "wind_direction_error": (wind_error / np.maximum(speed, wind_error)).tolist(),
         "noise": noise[0].tolist(),
         "noise_error": noise[1].tolist(),
-        "text": "; ".join(
-            [*(f"at {group.altitude:.0f} m: {group.reason}" for group in groups if group.reason), *unseen]
-        ),
+        "text": "; ".join(f"at {group.altitude:.0f} m: {group.reason}" for group in groups if group.reason),
     }
 
 

@@ -60,6 +60,17 @@ def test_it_holds_what_it_is_for() -> None:
     assert max(np.abs(command.commands).max() for command in commands) > 100e-9
 
 
+def test_a_profile_of_an_older_definition_is_read() -> None:
+    """Made when the outer scale's error was one of its logarithm: what was there is there, and no interval was told."""
+    with BagReader(BAG) as reader:
+        profiles = [reader.decode(m) for m in reader.messages(reader.topic(wire.PROFILE.name))]
+    assert [profile.source for profile in profiles] == ["ground", "file"]
+    for profile in profiles:
+        assert (profile.outer_scale, profile.outer_scale_low, profile.outer_scale_high) == (25, 0, 0)
+        assert np.isnan(profile.r0_error) and np.isnan(profile.fraction_error).all()
+    np.testing.assert_allclose(profiles[1].fraction, [0.6, 0.25, 0.15], rtol=1e-6)
+
+
 def test_every_command_bit_for_bit() -> None:
     outcome = replay(BAG)
     assert (outcome.compared, outcome.differing, outcome.held) == (FRAMES, 0, 2), outcome

@@ -83,6 +83,8 @@ def test_a_running_plant_changes_as_it_says(start_process) -> None:
         assert frame.slopes.tobytes() == expected.tobytes(), frame.frame
     assert last.changes == 3 and last.photons[:2] == pytest.approx([1e5, 1.5e6])
     assert truths[0].r0 == pytest.approx(0.16) and truths[-1].r0 == pytest.approx(0.08)
+    # the truth is its own interval
+    assert {(t.outer_scale_low, t.outer_scale, t.outer_scale_high) for t in truths} == {(8.0, 8.0, 8.0)}
     assert truths[-1].wind_direction == pytest.approx([math.radians(160)] * 3)
     assert len(truths) >= 5  # the drift shows
     assert telescope[0].elevation == pytest.approx(math.radians(70)) and telescope[0].sodium_height == 90e3

@@ -45,13 +45,13 @@ def sent(kind: str, fields: dict[str, Any]) -> Any:
     return decode(f"msgs_schema/msg/{kind}", encode(f"msgs_schema/msg/{kind}", **fields))
 
 
-def learned() -> Learned:
+def learned(outer_scale_range: tuple[float, float] = (15.0, 28.0)) -> Learned:
     groups = (Group((0, 1), 500.0, 0.7, 0.02, 50.0, "they correlate"), Group((2,), 9000.0, 0.3, 0.01, 80.0, ""))
     noise = (NoiseLevel(0, 4.0, 0.4), NoiseLevel(2, 1.0, 0.1))
     altitudes, fractions = np.array([0.0, 1000.0, 9000.0]), np.array([0.5, 0.2, 0.3])
     values: dict[str, Any] = dict.fromkeys(("measured", "fitted", "sampling"))
     return Learned(
-        r0=0.1, r0_sigma=0.002, outer_scale=20.0, outer_scale_range=(15.0, math.inf), altitudes=altitudes,
+        r0=0.1, r0_sigma=0.002, outer_scale=20.0, outer_scale_range=outer_scale_range, altitudes=altitudes,
         fractions=fractions, groups=groups, noise=noise, n_frames=500, n_effective=60.0, iterations=4, **values,
     )  # fmt: skip
 
@@ -65,11 +65,10 @@ def test_a_learned_sky(mini: System, window: Statistics) -> None:
     assert (message.session, message.first_frame, message.last_frame, message.n_frames) == (7, 100, 1100, 500)
     assert message.altitude == pytest.approx([500, 9000])
     assert message.fraction_error == pytest.approx([0.02, 0.01])
-    assert message.text == "at 500 m: they correlate; outer scale above 15 m"
+    assert message.text == "at 500 m: they correlate"
     # rms over the file's, of the sensors that told
     assert message.noise == pytest.approx([2.0, math.nan, 1.0, math.nan], nan_ok=True)
     assert message.noise_error == pytest.approx([0.1, math.nan, 0.05, math.nan], nan_ok=True)
-    assert math.isnan(message.log_outer_scale_error)
     # what is not seen is supposed to be the file's
     assert message.wind_speed[0] == pytest.approx(8.0)
     assert message.wind_speed_error[0] == pytest.approx(0.2)
@@ -77,9 +76,18 @@ def test_a_learned_sky(mini: System, window: Statistics) -> None:
     assert message.wind_speed[1] > 10 and math.isnan(message.wind_speed_error[1])
 
 
+@pytest.mark.parametrize("high", [28.0, math.inf])
+def test_an_outer_scale_is_told_by_its_interval_seen_or_not(mini: System, window: Statistics, high: float) -> None:
+    message = sent("AtmosphereProfile", learned_fields(mini, LearnedSky(learned((15.0, high)), mini, ()), window))
+    assert (message.outer_scale_low, message.outer_scale, message.outer_scale_high) == (15.0, 20.0, high)
+    assert "outer scale" not in message.text
+
+
 def test_a_sky_that_was_not_learned(mini: System) -> None:
     message = sent("AtmosphereProfile", believed_fields(mini))
     assert message.r0 == pytest.approx(0.16)
+    assert message.outer_scale == 25.0
+    assert math.isnan(message.outer_scale_low) and math.isnan(message.outer_scale_high)
     assert np.isnan(message.fraction_error).all() and len(message.fraction_error) == 3
 
 
