@@ -14,15 +14,13 @@ from numpy.typing import NDArray
 
 from srtomo_core.layout import Layout
 from srtomo_core.system import System
-from srtomo_srtc.likelihood import information, inverse_of, non_negative_step, score
+from srtomo_srtc.likelihood import information, inverse_of, non_negative_step, score, with_ridge
 from srtomo_srtc.sampling import Sampling
-from srtomo_srtc.sky_model import SkyModel
+from srtomo_srtc.sky_model import POWER, SkyModel
 
 Array = NDArray[np.float64]
 
 _ANYWHERE = math.sqrt(8 / 15)  # rms of 4 t (1 - t) for t in 0 to 1: of D over where the layer is, to that half-way
-_DIFFERENCE = 1.05  # of outer scales, for the derivative
-_RIDGE = 1e-7  # of the information
 
 
 def spread_between(
@@ -34,7 +32,6 @@ def spread_between(
     outer_scale: float,
     levels: Array,
     told: Array,
-    power: float,
 ) -> Array:
     """1-sigma error of what is told, for want of layers between those of the grid, (n_told,).
 
@@ -48,20 +45,18 @@ def spread_between(
         strengths: (n_layers,) m^(-5/3).
         outer_scale: m.
         levels: (n_sensors,) of noise.
-        told: (n_told, n_layers + 1 + n_sensors), each as a sum of strengths, L0^-power and levels.
+        told: (n_told, n_layers + 1 + n_sensors), each as a sum of strengths, L0^-POWER and levels.
     """
     n = len(heights)
     model = SkyModel(system, layout, sampling, np.concatenate([heights, (heights[1:] + heights[:-1]) / 2]))
     layers = [model.layer(l, outer_scale) for l in range(2 * n - 1)]
     turbulence = np.tensordot(strengths.astype(np.float32), layers[:n], axes=1)
-    near, padded = outer_scale / _DIFFERENCE, np.concatenate([strengths, np.zeros(n - 1)])
-    slope = (model.turbulence(padded, near) - turbulence) / np.float32(near**-power - outer_scale**-power)
+    slope = model.by_outer_scale(np.concatenate([strengths, np.zeros(n - 1)]), outer_scale, turbulence)
     C = turbulence.astype(np.float64) + sum(level * noise for level, noise in zip(levels, model.noise, strict=True))
     inverse = inverse_of(C + model.unseen(float(C.trace()) / len(C))).astype(np.float32)
     bases = [*layers[:n], slope, *model.noise]
-    F = information(inverse, bases)
-    F[np.diag_indices_from(F)] *= 1 + _RIDGE
-    theta = np.concatenate([strengths, [outer_scale**-power], levels])
+    F = with_ridge(information(inverse, bases))
+    theta = np.concatenate([strengths, [outer_scale**-POWER], levels])
     squares = np.zeros((2, len(told)))
     for l in range(n - 1):
         strength = (strengths[l] + strengths[l + 1]) / 2

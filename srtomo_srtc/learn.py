@@ -20,11 +20,11 @@ from srtomo_core.layout import Layout, SensorLayout
 from srtomo_core.system import Atmosphere, Layer, Sensor, System
 from srtomo_srtc.between import spread_between
 from srtomo_srtc.frozen_flow import independent_frames
-from srtomo_srtc.likelihood import information, inverse_of, non_negative_step, score
+from srtomo_srtc.likelihood import information, inverse_of, non_negative_step, score, with_ridge
 from srtomo_srtc.model import layout_of
 from srtomo_srtc.noise import slope_noise
 from srtomo_srtc.sampling import Sampling
-from srtomo_srtc.sky_model import SkyModel
+from srtomo_srtc.sky_model import POWER, SkyModel
 from srtomo_srtc.telemetry import Statistics
 
 Array = NDArray[np.float64]
@@ -41,18 +41,15 @@ TOP = 18e3
 _LAYERS = 10  # of the default grid, at most
 _R0 = 0.01, 2.0  # m along the line of sight: what is outside is no sky
 _OUTER_SCALES = 3.0, 300.0  # m
-_POWER = 1.5  # the outer scale enters as L0^-1.5, in which the slopes' covariance is nearly linear
 _CONVERGED = 1e-6  # squared step over the squared error from one frame
 _NEAR = 1e-2  # likewise: closer, the information is that of the solution
 _ITERATIONS = 20
 _RELINEARISE = 0.15  # change of log L0 that the derivative is not trusted with
 _REBUILD = 0.2  # likewise, single layers: only directions in which to look, once their sum is right
-_DIFFERENCE = 1.05  # of outer scales, for the derivative
 _STRIDE = 1.0  # of log L0 in an iteration, at most
 _EVERYWHERE = 0.1  # of the turbulence to start from: a layer without any is slow to gain some
 _FEWEST = 50  # frames
 _FEW = 400  # slopes to start with
-_RIDGE = 1e-7  # of the information, where layers are all but the same
 
 
 class LearnError(ValueError):
@@ -218,11 +215,11 @@ def fit(
     per_strength = shape @ layers.trace(axis1=1, axis2=2)
     trace = float(S.trace())
     scale = max(trace - start @ noise.trace(axis1=1, axis2=2), 0.1 * trace) / per_strength
-    theta = np.concatenate([scale * shape, [outer_scale**-_POWER], start])
+    theta = np.concatenate([scale * shape, [outer_scale**-POWER], start])
     unseen = model.unseen(trace / len(S)).astype(np.float64)
     far = True
     for iteration in range(1, _ITERATIONS + 1):
-        c, outer_scale, levels = theta[:n_layers], theta[n_layers] ** (-1 / _POWER), theta[n_layers + 1 :]
+        c, outer_scale, levels = theta[:n_layers], theta[n_layers] ** (-1 / POWER), theta[n_layers + 1 :]
         moved = not abs(math.log(outer_scale / at)) < _REBUILD
         if moved:
             at = outer_scale
@@ -233,16 +230,12 @@ def fit(
             of_layers = _total(layers, c)
             turbulence = of_layers if math.isclose(here, at) else model.turbulence(c, here)
             lack = turbulence - of_layers
-            # nearly linear: a difference to one side will do
-            near = here / _DIFFERENCE
-            slope[:] = model.turbulence(c, near) - turbulence
-            slope /= np.float32(near**-_POWER - here**-_POWER)
-        C: Array = lack + _total(bases, np.concatenate([c, [theta[n_layers] - here**-_POWER], levels])) + unseen
+            slope[:] = model.by_outer_scale(c, here, turbulence)
+        C: Array = lack + _total(bases, np.concatenate([c, [theta[n_layers] - here**-POWER], levels])) + unseen
         try:
             inverse = inverse_of(C).astype(np.float32)
             if far:
-                F = information(model.seen(inverse), [*layers, slope, *model.whole_noise])
-                F[np.diag_indices_from(F)] *= 1 + _RIDGE
+                F = with_ridge(information(model.seen(inverse), [*layers, slope, *model.whole_noise]))
             g = score(inverse, (S + unseen - C).astype(np.float32), bases)
             if not (np.isfinite(F).all() and np.isfinite(g).all() and np.all(np.diag(F) > 0)):
                 raise LearnError("no sky fits: the likelihood is not finite")
@@ -278,11 +271,129 @@ def _total(bases: NDArray[np.float32], factors: Array) -> NDArray[np.float32]:
 def _within(theta: Array, aim: Array, n_layers: int) -> Array:
     """``aim``, less far from ``theta`` in outer scale than it may be, and with some noise left."""
     out = aim.copy()
-    far = math.exp(_POWER * _STRIDE)
-    low, high = sorted(scale**-_POWER for scale in _OUTER_SCALES)
+    far = math.exp(POWER * _STRIDE)
+    low, high = sorted(scale**-POWER for scale in _OUTER_SCALES)
     out[n_layers] = np.clip(aim[n_layers], max(theta[n_layers] / far, low), min(theta[n_layers] * far, high))
     out[n_layers + 1 :] = np.maximum(aim[n_layers + 1 :], 0.1 * theta[n_layers + 1 :])
     return out
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """The sky that fits best, which can be told with the errors that go with one wind or another.
+
+    Attributes:
+        system: the instrument.
+        layout: where sensors are taken to be.
+        statistics: that were fitted.
+        altitudes: (n_layers,) m above the telescope.
+        anywhere: errors are to allow for turbulence between these.
+        limit: number of slopes to work with, at most about.
+        model: that was fitted.
+        measured: (n, n) covariance of its slopes, rad^2.
+        found: the fit.
+    """
+
+    system: System
+    layout: Layout
+    statistics: Statistics
+    altitudes: Array
+    anywhere: bool
+    limit: int
+    model: SkyModel
+    measured: NDArray[np.float32]
+    found: Fit
+
+    def told(self, velocity: Array | None = None) -> Learned:
+        """What is learned, with errors.
+
+        Args:
+            velocity: as in :func:`learn`.
+
+        Raises:
+            ValueError: it has another shape.
+        """
+        flow = winds_at(self.system, self.altitudes) if velocity is None else np.asarray(velocity, np.float64)
+        if flow.shape != (len(self.altitudes), 2):
+            raise ValueError(f"velocity: expected shape {(len(self.altitudes), 2)}, got {flow.shape}")
+        model, found, altitudes = self.model, self.found, self.altitudes
+        n_layers, n_sensors = len(altitudes), len(model.noise)
+        one_frame = np.asarray(np.linalg.inv(found.information), np.float64)
+        total = float(found.strengths.sum())
+        groups, reasons = _merge(one_frame[:n_layers, :n_layers])
+        fractions = np.array([found.strengths[list(group)].sum() / total for group in groups])
+
+        # what is told, each as a sum of the parameters: log r0, fractions, outer scale, noise levels
+        told = np.zeros((1 + len(groups) + 1 + n_sensors, n_layers + 1 + n_sensors))
+        told[0, :n_layers] = -0.6 / total
+        for row, group, fraction in zip(told[1:], groups, fractions):
+            row[list(group)] = 1 / total
+            row[:n_layers] -= fraction / total
+        told[1 + len(groups) :, n_layers:] = np.eye(1 + n_sensors)
+
+        n_effective = self._independent(told @ one_frame, flow)
+        sigma = np.sqrt(np.einsum("ij,jk,ik->i", told, one_frame, told) / n_effective)
+        if self.anywhere and n_layers > 1:
+            sigma = np.hypot(sigma, self._between(told))
+        scale, scale_sigma = found.outer_scale**-POWER, float(sigma[1 + len(groups)])
+        large, small = scale - scale_sigma, scale + scale_sigma
+        altitude = [
+            float(np.average(altitudes[list(g)], weights=found.strengths[list(g)] + 1e-9 * total)) for g in groups
+        ]
+        to_zenith = math.cos(self.system.zenith_angle) ** -0.6
+        return Learned(
+            r0=total**-0.6 * to_zenith,
+            r0_sigma=float(sigma[0]) * total**-0.6 * to_zenith,
+            outer_scale=found.outer_scale,
+            outer_scale_range=(small ** (-1 / POWER), large ** (-1 / POWER) if large > 0 else math.inf),
+            altitudes=altitudes,
+            fractions=found.strengths / total,
+            groups=tuple(
+                Group(
+                    group, altitude[i], float(fractions[i]), float(sigma[1 + i]), float(n_effective[1 + i]), reasons[i]
+                )
+                for i, group in enumerate(groups)
+            ),
+            noise=tuple(
+                NoiseLevel(w, float(level), float(error))
+                for w, level, error in zip(model.noisy, found.levels, sigma[2 + len(groups) :])
+            ),
+            n_frames=self.statistics.n_frames,
+            n_effective=float(n_effective[0]),
+            iterations=found.iterations,
+            measured=self.measured,
+            fitted=np.asarray(
+                found.covariance - model.unseen(1.0) * (self.measured.trace() / len(self.measured)), np.float32
+            ),
+            sampling=model.sampling,
+        )
+
+    def _independent(self, influences: Array, velocity: Array) -> Array:
+        """(n_told,) independent frames, from a coarse model: only ratios matter."""
+        coarse = Sampling.of(self.system, self.layout, self.limit, 2)
+        return independent_frames(
+            SkyModel(self.system, self.layout, coarse, self.model.heights),
+            self.found.strengths,
+            self.found.outer_scale,
+            self.found.covariance,
+            self.found.bases,
+            influences,
+            velocity,
+            min(part.place.size for part in self.model.sampling.parts),
+            self.statistics.duration / (self.statistics.n_frames - 1),
+            self.statistics.n_frames,
+        )
+
+    def _between(self, told: Array) -> Array:
+        """(n_told,) of turbulence between the grid's altitudes; by few slopes, or by as many as have to be."""
+        try:
+            coarse = Sampling.of(self.system, self.layout, min(_FEW, self.limit // 2), 2)
+        except ValueError:
+            coarse = Sampling.of(self.system, self.layout, self.limit, 2)
+        found = self.found
+        return spread_between(
+            self.system, self.layout, coarse, self.model.heights, found.strengths, found.outer_scale, found.levels, told
+        )
 
 
 def learn(
@@ -315,13 +426,22 @@ def learn(
         ValueError: the statistics or the layout are another instrument's; the altitudes are not ascending; ``limit`` is
             too small.
     """
+    return solve(system, statistics, layout=layout, altitudes=altitudes, limit=limit).told(velocity)
+
+
+def solve(
+    system: System,
+    statistics: Statistics,
+    *,
+    layout: Layout | None = None,
+    altitudes: Sequence[float] | None = None,
+    limit: int = LIMIT,
+) -> Solution:
+    """As :func:`learn`, where the winds that decide the errors are not known yet."""
     layout = layout_of(system, layout)
     grid = default_altitudes(system, layout) if altitudes is None else np.asarray(altitudes, np.float64)
     if grid.ndim != 1 or not len(grid) or grid[0] < 0 or not np.all(np.diff(grid) > 0):
         raise ValueError("altitudes: expected ascending metres above the telescope")
-    flow = winds_at(system, grid) if velocity is None else np.asarray(velocity, np.float64)
-    if flow.shape != (len(grid), 2):
-        raise ValueError(f"velocity: expected shape {(len(grid), 2)}, got {flow.shape}")
     _check(statistics, layout)
     sampling = Sampling.of(system, layout, limit)
     model = SkyModel(system, layout, sampling, grid * system.airmass)
@@ -331,7 +451,7 @@ def learn(
     if not S.trace() > 0:
         raise LearnError("the slopes do not move")
     found = fit(model, S, *_start(system, layout, model, statistics, limit))
-    return _told(system, layout, model, found, S, statistics, grid, flow, limit, anywhere=altitudes is None)
+    return Solution(system, layout, statistics, grid, altitudes is None, limit, model, S, found)
 
 
 def _start(
@@ -410,99 +530,6 @@ def _check(statistics: Statistics, layout: Layout) -> None:
         raise ValueError(f"statistics: expected covariance of shape {(n, n)}, got {statistics.covariance.shape}")
     if statistics.n_frames < _FEWEST:
         raise LearnError(f"{statistics.n_frames} frames are too few: expected at least {_FEWEST}")
-
-
-def _told(
-    system: System,
-    layout: Layout,
-    model: SkyModel,
-    found: Fit,
-    S: NDArray[np.float32],
-    statistics: Statistics,
-    altitudes: Array,
-    velocity: Array,
-    limit: int,
-    anywhere: bool,
-) -> Learned:
-    n_layers, n_sensors = len(altitudes), len(model.noise)
-    one_frame = np.asarray(np.linalg.inv(found.information), np.float64)
-    total = float(found.strengths.sum())
-    groups, reasons = _merge(one_frame[:n_layers, :n_layers])
-    fractions = np.array([found.strengths[list(group)].sum() / total for group in groups])
-
-    # what is told, each as a sum of the parameters: log r0, fractions, outer scale, noise levels
-    told = np.zeros((1 + len(groups) + 1 + n_sensors, n_layers + 1 + n_sensors))
-    told[0, :n_layers] = -0.6 / total
-    for row, group, fraction in zip(told[1:], groups, fractions):
-        row[list(group)] = 1 / total
-        row[:n_layers] -= fraction / total
-    told[1 + len(groups) :, n_layers:] = np.eye(1 + n_sensors)
-
-    n_effective = _independent(system, layout, model, found, told @ one_frame, velocity, statistics, limit)
-    sigma = np.sqrt(np.einsum("ij,jk,ik->i", told, one_frame, told) / n_effective)
-    if anywhere and n_layers > 1:
-        coarse = _coarse(system, layout, limit)
-        sky = found.strengths, found.outer_scale, found.levels
-        sigma = np.hypot(sigma, spread_between(system, layout, coarse, model.heights, *sky, told, _POWER))
-    scale, scale_sigma = found.outer_scale**-_POWER, float(sigma[1 + len(groups)])
-    large, small = scale - scale_sigma, scale + scale_sigma
-    altitude = [float(np.average(altitudes[list(g)], weights=found.strengths[list(g)] + 1e-9 * total)) for g in groups]
-    return Learned(
-        r0=total**-0.6 * math.cos(system.zenith_angle) ** -0.6,
-        r0_sigma=float(sigma[0]) * total**-0.6 * math.cos(system.zenith_angle) ** -0.6,
-        outer_scale=found.outer_scale,
-        outer_scale_range=(small ** (-1 / _POWER), large ** (-1 / _POWER) if large > 0 else math.inf),
-        altitudes=altitudes,
-        fractions=found.strengths / total,
-        groups=tuple(
-            Group(group, altitude[i], float(fractions[i]), float(sigma[1 + i]), float(n_effective[1 + i]), reasons[i])
-            for i, group in enumerate(groups)
-        ),
-        noise=tuple(
-            NoiseLevel(w, float(level), float(error))
-            for w, level, error in zip(model.noisy, found.levels, sigma[2 + len(groups) :])
-        ),
-        n_frames=statistics.n_frames,
-        n_effective=float(n_effective[0]),
-        iterations=found.iterations,
-        measured=S,
-        fitted=np.asarray(found.covariance - model.unseen(1.0) * (S.trace() / len(S)), np.float32),
-        sampling=model.sampling,
-    )
-
-
-def _coarse(system: System, layout: Layout, limit: int) -> Sampling:
-    """Few slopes, or as many as have to be."""
-    try:
-        return Sampling.of(system, layout, min(_FEW, limit // 2), 2)
-    except ValueError:
-        return Sampling.of(system, layout, limit, 2)
-
-
-def _independent(
-    system: System,
-    layout: Layout,
-    model: SkyModel,
-    found: Fit,
-    influences: Array,
-    velocity: Array,
-    statistics: Statistics,
-    limit: int,
-) -> Array:
-    """(n_told,) independent frames, from a coarse model: only ratios matter."""
-    coarse = SkyModel(system, layout, Sampling.of(system, layout, limit, 2), model.heights)
-    return independent_frames(
-        coarse,
-        found.strengths,
-        found.outer_scale,
-        found.covariance,
-        found.bases,
-        influences,
-        velocity,
-        min(part.place.size for part in model.sampling.parts),
-        statistics.duration / (statistics.n_frames - 1),
-        statistics.n_frames,
-    )
 
 
 def _merge(covariance: Array) -> tuple[list[tuple[int, ...]], list[str]]:

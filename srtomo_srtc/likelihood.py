@@ -22,6 +22,7 @@ from scipy.optimize import nnls
 Array = NDArray[np.float64]
 Single = NDArray[np.float32]
 
+_RIDGE = 1e-7  # of the information, where layers are all but the same
 _ROWS = 16  # whose products are summed in float32
 
 
@@ -43,6 +44,12 @@ def information(inverse: Single, bases: Sequence[Single | sparse.csr_array]) -> 
         turned = products[:, :, rows].transpose(0, 2, 1)
         F += products[:, rows].reshape(len(F), -1) @ turned.reshape(len(F), -1).T
     return 0.25 * (F + F.T)
+
+
+def with_ridge(F: Array) -> Array:
+    """``F``, which is changed, so that it can be inverted."""
+    F[np.diag_indices_from(F)] *= 1 + _RIDGE
+    return F
 
 
 def score(inverse: Single, difference: Single, bases: Sequence[Single] | Single) -> Array:

@@ -20,6 +20,10 @@ from srtomo_srtc.wind import sensors_carried
 Array = NDArray[np.float64]
 Single = NDArray[np.float32]
 
+POWER = 1.5
+"""The outer scale enters as L0^-1.5, in which the slopes' covariance is nearly linear."""
+
+_DIFFERENCE = 1.05  # of outer scales, for the derivative
 _REACH = 8.0  # m: tables are made for multiples of it, so that what differs a little shares one
 
 
@@ -71,6 +75,15 @@ class SkyModel:
     def turbulence(self, strengths: Array, outer_scale: float) -> Single:
         """sum_l c_l B_l, (n, n) rad^2."""
         return self._covariance(strengths, outer_scale, slice(None))
+
+    def by_outer_scale(self, strengths: Array, outer_scale: float, turbulence: Single) -> Single:
+        """Derivative of :meth:`turbulence`, which is given, by L0^-POWER: (n, n).
+
+        A difference to one side, which will do for what is nearly linear.
+        """
+        near = outer_scale / _DIFFERENCE
+        difference = self.turbulence(strengths, near) - turbulence
+        return np.asarray(difference / np.float32(near**-POWER - outer_scale**-POWER), np.float32)
 
     def lagged(
         self, strengths: Array, outer_scale: float, velocity: Array, time: float, layers: slice = slice(None)
