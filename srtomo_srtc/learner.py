@@ -23,11 +23,9 @@ from srtomo_core.reconstructor import Reconstructor
 from srtomo_core.system import System
 from srtomo_srtc.decide import Action, Comparison, Decider, Rules, State, compare
 from srtomo_srtc.health import FEWEST_BLOCKS, Estimate, FlowModel, Health, SlopeModel, block_mean
-from srtomo_srtc.learn import Learned, learn
-from srtomo_srtc.learn_wind import LayerWind, learn_winds, with_winds
+from srtomo_srtc.learned_sky import LearnedSky
 from srtomo_srtc.predict import Prediction, mean_wfe
 from srtomo_srtc.telemetry import HeldOut, Recent, Statistics
-from srtomo_srtc.wind import with_trusted_winds
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,55 +55,6 @@ class Belief:
 def model_of(system: System, ahead: int, layout: Layout | None = None) -> SlopeModel:
     """As :meth:`Belief.model`."""
     return FlowModel(system, ahead / system.loop.rate, layout) if ahead else SlopeModel(system, layout)
-
-
-@dataclass(frozen=True, eq=False)
-class LearnedSky:
-    """What a window told.
-
-    Attributes:
-        learned: strengths and noise.
-        system: the instrument under that sky.
-        winds: of each group of layers that holds turbulence; empty where they were not asked for.
-    """
-
-    learned: Learned
-    system: System
-    winds: tuple[LayerWind, ...] = ()
-
-
-def learned_sky(system: System, window: Statistics, *, winds: bool = False, layout: Layout | None = None) -> LearnedSky:
-    """Fit a window.
-
-    Args:
-        system: the instrument as its file says.
-        winds: learn them too, one for layers that are told as one; each is believed as far as it is known, and where it
-            is not seen as the file has it.
-        layout: where sensors are taken to be; as in the system when not given.
-
-    Raises:
-        LearnError: no sky can be told from it.
-    """
-    learned = learn(system, window, layout=layout)
-    believed = learned.system(system, layout=layout)
-    if not winds:
-        return LearnedSky(learned, believed)
-    found = learn_winds(learned.system(system, layout=layout, merged=True), window, layout)
-    told = (group for group in learned.groups if group.fraction > 0)
-    of_layer = {l: wind for group, wind in zip(told, found, strict=True) for l in group.layers}
-    each = [of_layer[l] for l, fraction in enumerate(learned.fractions) if fraction > 0]
-    believed = with_trusted_winds(with_winds(believed, each), [0.0 if wind.reason else wind.sigma for wind in each])
-    return LearnedSky(learned, believed, found)
-
-
-def lags_of(system: System, every: int) -> tuple[int, ...]:
-    """Lags, in exposures, at which telemetry shows the winds: of half a sub-aperture and a whole one at 10 m/s.
-
-    Args:
-        every: exposures from one counted frame to the next; lags are multiples of it.
-    """
-    size = min(system.telescope.diameter / sensor.subapertures for sensor in system.sensors)
-    return tuple(every * max(i, round(i * size / 20 * system.loop.rate / every)) for i in (1, 2))
 
 
 class Outcome(enum.IntEnum):

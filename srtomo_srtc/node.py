@@ -46,7 +46,8 @@ from srtomo_core.reconstructor import Reconstructor, ReconstructorError, block_t
 from srtomo_core.system import InstrumentError, System, load_system
 from srtomo_srtc.closures import Closures, sets_of_lasers
 from srtomo_srtc.decide import Rules
-from srtomo_srtc.learner import Belief, Judgement, Learner, Outcome, lags_of, learned_sky
+from srtomo_srtc.learned_sky import lags_of, learned_sky
+from srtomo_srtc.learner import Belief, Judgement, Learner, Outcome
 from srtomo_srtc.listener import Listener
 from srtomo_srtc.model import ground_prior
 from srtomo_srtc.order import Order, Step

@@ -9,7 +9,8 @@ import numpy as np
 
 from srtomo_core.system import System
 from srtomo_srtc.learn import winds_at
-from srtomo_srtc.learner import Judgement, LearnedSky, Outcome
+from srtomo_srtc.learned_sky import LearnedSky
+from srtomo_srtc.learner import Judgement, Outcome
 from srtomo_srtc.telemetry import NoWindow, Statistics
 
 

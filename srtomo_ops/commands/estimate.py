@@ -17,9 +17,9 @@ from srtomo_core.layout import Layout
 from srtomo_core.reconstructor import load_interaction_matrix
 from srtomo_core.system import System
 from srtomo_ops.options import add_registration, writable_file, write_json
-from srtomo_srtc.learn import LIMIT, Group, Learned, learn
-from srtomo_srtc.learn_wind import LayerWind, learn_winds
-from srtomo_srtc.learner import lags_of
+from srtomo_srtc.learn import LIMIT, Group, Learned
+from srtomo_srtc.learn_wind import LayerWind
+from srtomo_srtc.learned_sky import lags_of, learned_sky
 from srtomo_srtc.mirrors import interaction_matrix
 from srtomo_srtc.registration import registered_layout
 from srtomo_srtc.sampling import FEWEST, Sampling
@@ -83,11 +83,11 @@ def main(options: argparse.Namespace) -> int:
         Sampling.of(system, layout, options.slopes)  # before any work
         statistics = _statistics(reader, system, layout, options.interaction_matrix, options.winds)
     start = time.perf_counter()
-    learned = learn(system, statistics, layout=layout, altitudes=options.altitudes, limit=options.slopes)
-    found: tuple[LayerWind, ...] = ()
-    if options.winds:
-        found = learn_winds(learned.system(system, layout=layout, merged=True), statistics, layout)
-    winds = dict(zip((group for group in learned.groups if group.fraction > 0), found))
+    sky = learned_sky(
+        system, statistics, winds=options.winds, layout=layout, altitudes=options.altitudes, limit=options.slopes
+    )
+    learned = sky.learned
+    winds = dict(zip((group for group in learned.groups if group.fraction > 0), sky.winds))
     seconds = time.perf_counter() - start
     supposed = BETWEEN if options.altitudes is None else ONLY_AT
     _print(system, statistics, learned, winds, supposed)

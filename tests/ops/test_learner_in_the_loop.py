@@ -26,17 +26,8 @@ from srtomo_sim.sky import Sky, prepare
 from srtomo_srtc.decide import Action, Decider, Decision, Rules
 from srtomo_srtc.health import Health, SlopeModel
 from srtomo_srtc.learn import LearnError
-from srtomo_srtc.learner import (
-    Belief,
-    Build,
-    Fit,
-    Judgement,
-    LearnedSky,
-    Learner,
-    Outcome,
-    lags_of,
-    learned_sky,
-)
+from srtomo_srtc.learned_sky import LearnedSky, lags_of, learned_sky
+from srtomo_srtc.learner import Belief, Build, Fit, Judgement, Learner, Outcome
 from srtomo_srtc.reconstructors import implicit, predictive
 from srtomo_srtc.register import moved_sensors
 from srtomo_srtc.telemetry import BLOCKS, STRETCHES, Statistics, Telemetry

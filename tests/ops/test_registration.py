@@ -217,17 +217,18 @@ def _wfe(run: Run, first: int, last: int) -> float:
 
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
-def test_registration_from_30_s_of_closed_loop() -> None:
+@pytest.mark.parametrize(("seed", "direction"), [(5, 0.0), (6, 90 * DEGREE), (7, 215 * DEGREE)])
+def test_registration_from_30_s_of_closed_loop(seed: int, direction: float) -> None:
     # every layer goes the same way at 10 m/s: there the lag looks most like a shift
     system = load_system(
         "gnao_ltao_sr",
-        {"atmosphere.layers.*.wind_speed": 10.0, "atmosphere.layers.*.wind_direction": 0.0},
+        {"atmosphere.layers.*.wind_speed": 10.0, "atmosphere.layers.*.wind_direction": direction},
     )
     moves = MOVES | {3: (0.2, 0.2, -1.5 * DEGREE, 0)}  # that is worth a swap
     layout, seconds = Layout(system), 30
     n = round(seconds * system.loop.rate)
     truth = _moved(system, layout, moves)
-    sky = prepare(system, n, 5, layout=truth, science_every=20)
+    sky = prepare(system, n, seed, layout=truth, science_every=20)
     believed, G = implicit(system)
     pattern, half = dither_pattern(system, layout, 5e-9), 10
     slot = Slot(layout)

@@ -15,7 +15,8 @@ from srtomo_srtc.atmosphere import Profile
 from srtomo_srtc.covariance import Turbulence, slope_covariance
 from srtomo_srtc.decide import Action, Decider, Decision
 from srtomo_srtc.health import OVERSAMPLING
-from srtomo_srtc.learner import Belief, Judgement, LearnedSky, Learner, Outcome
+from srtomo_srtc.learned_sky import LearnedSky
+from srtomo_srtc.learner import Belief, Judgement, Learner, Outcome
 from srtomo_srtc.model import blind_modes, ground_prior, noise_covariance, project_both_sides, sightlines
 from srtomo_srtc.order import Order, Step
 from srtomo_srtc.reconstructors import implicit

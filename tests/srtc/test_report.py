@@ -14,7 +14,8 @@ from srtomo_srtc.decide import Comparison, compare
 from srtomo_srtc.health import Health, SlopeModel
 from srtomo_srtc.learn import Group, Learned, NoiseLevel
 from srtomo_srtc.learn_wind import LayerWind
-from srtomo_srtc.learner import Belief, Judgement, LearnedSky, Learner, Outcome
+from srtomo_srtc.learned_sky import LearnedSky
+from srtomo_srtc.learner import Belief, Judgement, Learner, Outcome
 from srtomo_srtc.reconstructors import implicit
 from srtomo_srtc.report import believed_fields, diagnosis, health_fields, learned_fields
 from srtomo_srtc.telemetry import HeldOut, Statistics
