@@ -20,6 +20,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from types import FrameType
@@ -288,6 +289,9 @@ class SrtcNode(Node):
         self._watch: Worker[Recent] = Worker("watch", learner.watch)
         for thread in (self._listener, self._fits, self._watch):
             thread.start()
+            # its name for `top -H`, which Python's threads have not got from themselves
+            with suppress(OSError):
+                Path(f"/proc/self/task/{thread.native_id}/comm").write_text(thread.name)
         self.create_subscription(HrtcStatus, wire.STATUS.name, self._on_status, QoSProfile(**wire.STATUS.qos()))
         self._commit = self.create_client(SwapReconstructor, "hrtc/commit")
         self._roll_back = self.create_client(SwapReconstructor, "hrtc/roll_back")
