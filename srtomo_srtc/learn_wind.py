@@ -4,6 +4,7 @@ Frozen flow says what slopes have in common with slopes a lag t earlier: ``<s[k]
 with B_l(d) the covariance of layer l with itself displaced by d. The velocities that fit the measured matrices best
 are found in least squares, whitened by the slopes' own covariance: from the peak of the correlation with B_l(v t) over
 a grid of velocities, strongest layer first, each found one taken off; then all together by Gauss-Newton over all lags.
+What a coarse grid leaves of strong layers can hide a weak one: each is looked for again in what is left by then.
 """
 
 from __future__ import annotations
@@ -36,6 +37,7 @@ _SPEEDS = np.arange(0.0, 31.0, 5.0)  # m/s, of the grid
 _DIRECTIONS = 12  # an even number
 _STEP = 0.3  # m/s, of the central differences
 _ITERATIONS = 20
+_AGAIN = 3  # times that a layer is looked for elsewhere, at most
 _DAMPED = 1e-3  # of the best seen component's information: a layer that is hardly seen stays where it is
 _CLOSE = 0.01  # m/s: a step this small is the last
 _CURVED = 0.2  # m/s: farther, derivatives are made anew
@@ -108,7 +110,7 @@ def learn_winds(
     measured = {lag * per_frame: model.measured(matrix).astype(np.float64) for lag, matrix in statistics.lagged.items()}
     pairs = min(statistics.lagged_frames.values())
     flow = _Flow(model, profile, measured)
-    found, slopes = flow.refine(flow.search())
+    found, slopes = flow.find()
     covariance = flow.covariance(found, slopes, pairs, statistics.interval)
     layers = [
         (layer.altitude, fraction)
@@ -170,6 +172,8 @@ class _Flow:
         self._outer_scale = profile.outer_scale
         self._strengths = profile.fractions * profile.r0 ** (-5 / 3)
         self._measured = dict(sorted(measured.items()))
+        self._time = list(self._measured)[len(self._measured) // 2]  # the lag that is searched
+        self._grid: dict[int, list[tuple[Array, Array, float]]] = {}  # B_l(v t) and its square, of each layer
         C = model.turbulence(self._strengths, self._outer_scale).astype(np.float64) + sum(model.noise)
         C += model.unseen(C.trace() / len(C))
         self._C = C
@@ -185,26 +189,70 @@ class _Flow:
         """A matrix A with A = C^-1: its sum over entries with another is their product in whitened slopes."""
         return np.asarray(self._inverse @ matrix @ self._inverse)
 
+    def find(self) -> tuple[Array, dict[float, _Slope]]:
+        """The velocities that fit best, as :meth:`refine` has them."""
+        found, slopes = self.refine(self.search())
+        for _ in range(_AGAIN):
+            elsewhere = self._elsewhere(found)
+            if elsewhere is None:
+                break
+            other = self.refine(elsewhere)
+            if not self._misfit(other[0]) < self._misfit(found):
+                break
+            found, slopes = other
+        return found, slopes
+
     def search(self) -> Array:
         """(n_layers, 2) the best velocities of a grid, m/s, layer after layer."""
-        time = list(self._measured)[len(self._measured) // 2]
-        left = self._whitened(self._measured[time])
+        left = self._whitened(self._measured[self._time])
         found = np.zeros((len(self._strengths), 2))
-        # the other half are their opposites: B_l(-d) = B_l(d)^T
-        turns = 2 * np.pi * np.arange(_DIRECTIONS // 2) / _DIRECTIONS
-        grid = [np.zeros(2), *(v * np.array([np.cos(a), np.sin(a)]) for v in _SPEEDS[1:] for a in turns)]
         for l in np.argsort(-self._strengths):
-            # what a velocity would take off the squares that are left
-            best = -np.inf
-            for velocity in grid:
-                B = self._layer(int(l), velocity, time)
-                square = float(np.vdot(self._whitened(B), B))
-                for there, correlation in ((velocity, B), (-velocity, B.T)):
-                    gain = 2 * float(np.vdot(left, correlation)) - square
-                    if gain > best:
-                        best, found[l], taken = gain, there, correlation
+            _, found[l], taken = self._best(int(l), left)
             left -= self._whitened(taken)
         return found
+
+    def _best(self, l: int, left: Array) -> tuple[float, Array, Array]:
+        """The velocity of the grid with which a layer takes most off the squares of what is left (whitened).
+
+        Returns:
+            How much, the velocity, and B_l(v t) there.
+        """
+        if l not in self._grid:
+            # the other half are their opposites: B_l(-d) = B_l(d)^T
+            turns = 2 * np.pi * np.arange(_DIRECTIONS // 2) / _DIRECTIONS
+            grid = [np.zeros(2), *(v * np.array([np.cos(a), np.sin(a)]) for v in _SPEEDS[1:] for a in turns)]
+            layers = [self._layer(l, velocity, self._time) for velocity in grid]
+            self._grid[l] = [(v, B, float(np.vdot(self._whitened(B), B))) for v, B in zip(grid, layers, strict=True)]
+        best, found, taken = -np.inf, np.zeros(2), left
+        for velocity, B, square in self._grid[l]:
+            for there, correlation in ((velocity, B), (-velocity, B.T)):
+                gain = 2 * float(np.vdot(left, correlation)) - square
+                if gain > best:
+                    best, found, taken = gain, there, correlation
+        return best, found, taken
+
+    def _elsewhere(self, velocities: Array) -> Array | None:
+        """The velocities with the layer moved that a place on the grid suits most better than its own; None: none."""
+        left = self._left(velocities, self._time)
+        most, found = 0.0, None
+        for l, velocity in enumerate(velocities):
+            own = self._layer(l, velocity, self._time)
+            alone = self._whitened(left + own)
+            gain, there, _ = self._best(l, alone)
+            more = gain - (2 * float(np.vdot(alone, own)) - float(np.vdot(self._whitened(own), own)))
+            if more > most:
+                most, found = more, velocities.copy()
+                found[l] = there
+        return found
+
+    def _left(self, velocities: Array, time: float) -> Array:
+        """What layers with these velocities leave of a measured covariance."""
+        return self._measured[time] - self._model.lagged(self._strengths, self._outer_scale, velocities, time)
+
+    def _misfit(self, velocities: Array) -> float:
+        """Whitened squares of that, of all lags."""
+        left = [self._left(velocities, time) for time in self._measured]
+        return sum(float(np.vdot(self._whitened(matrix), matrix)) for matrix in left)
 
     def refine(self, velocities: Array) -> tuple[Array, dict[float, _Slope]]:
         """The velocities that fit all lags best, from those given.
@@ -224,8 +272,8 @@ class _Flow:
                 seen = np.sqrt(diagonal / diagonal.max())
                 ridge = np.diag(diagonal + diagonal.max()) * _DAMPED
             score = np.zeros(velocities.size)
-            for time, measured in self._measured.items():
-                left = measured - self._model.lagged(self._strengths, self._outer_scale, velocities, time)
+            for time in self._measured:
+                left = self._left(velocities, time)
                 score += [np.vdot(W, left) for W in slopes[time].whitened]
             step = np.linalg.solve(information + ridge, score)
             step *= min(1.0, _STRIDE / max(float(np.abs(step).max()), 1e-9))

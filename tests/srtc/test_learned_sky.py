@@ -9,6 +9,7 @@ from srtomo_core.layout import Layout
 from srtomo_core.system import System, load_system
 from srtomo_srtc.atmosphere import Profile
 from srtomo_srtc.covariance import Turbulence, slope_covariance
+from srtomo_srtc.learn_wind import learn_winds
 from srtomo_srtc.learned_sky import learned_sky
 from srtomo_srtc.model import blind_modes, noise_covariance, sightlines
 from srtomo_srtc.telemetry import HeldOut, Statistics
@@ -62,3 +63,18 @@ def test_errors_go_with_the_winds_that_were_learned(truth: System) -> None:
     for few, many in zip(supposed.learned.groups, learned.learned.groups, strict=True):
         assert many.n_effective / few.n_effective == pytest.approx(4, rel=0.1)
         assert few.sigma / many.sigma == pytest.approx(2, rel=0.05)
+
+
+def test_a_weak_layer_is_found_behind_strong_ones() -> None:
+    """What a coarse grid of velocities leaves of the strong ones suits it better than its own wind at first."""
+    mini = load_system("mini")
+    sensors = [sensor.model_dump() | {"subapertures": 6, "photons": 2e5} for sensor in mini.sensors[:3]]
+    layers = [
+        {"altitude": 0.0, "fraction": 0.366, "wind_speed": 14.3, "wind_direction": 0.765},
+        {"altitude": 3000.0, "fraction": 0.119, "wind_speed": 9.3, "wind_direction": -1.184},
+        {"altitude": 10000.0, "fraction": 0.515, "wind_speed": 18.8, "wind_direction": 0.612},
+    ]
+    truth = mini.with_changes({"sensors": sensors, "loop.rate": 500.0, "atmosphere.layers": layers})
+    still = truth.with_changes({"atmosphere.layers.*.wind_speed": 0.0})
+    found = learn_winds(still, statistics(truth, 32, 2000))
+    assert np.array([wind.velocity for wind in found]) == pytest.approx(winds(truth), abs=0.5)
