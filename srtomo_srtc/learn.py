@@ -130,21 +130,15 @@ class Learned:
     fitted: NDArray[np.float32]
     sampling: Sampling
 
-    def system(
-        self, system: System, velocity: Array | None = None, layout: Layout | None = None, *, merged: bool = False
-    ) -> System:
+    def system(self, system: System, velocity: Array | None = None, layout: Layout | None = None) -> System:
         """The instrument with this sky and noise in it. Sensors with a measured noise covariance keep it.
 
         Args:
             system: whose telemetry was learned from.
             velocity: (n_layers, 2) of the layers, where they go, m/s; by default that of the system's own sky.
             layout: where sensors were taken to be.
-            merged: with a layer for each group, instead of all the grid's.
         """
-        altitudes, fractions = self.altitudes, self.fractions
-        if merged:
-            altitudes, fractions = np.array([(group.altitude, group.fraction) for group in self.groups]).T
-        flow = winds_at(system, altitudes) if velocity is None else velocity
+        flow = winds_at(system, self.altitudes) if velocity is None else velocity
         layers = [
             Layer(
                 altitude=float(altitude),
@@ -152,7 +146,7 @@ class Learned:
                 wind_speed=math.hypot(*wind),
                 wind_direction=math.atan2(wind[1], wind[0]),
             )
-            for altitude, fraction, wind in zip(altitudes, fractions, flow, strict=True)
+            for altitude, fraction, wind in zip(self.altitudes, self.fractions, flow, strict=True)
             if fraction > 0
         ]
         sky = Atmosphere(r0=self.r0, outer_scale=self.outer_scale, layers=tuple(layers))

@@ -39,7 +39,7 @@ _STEP = 0.3  # m/s, of the central differences
 _ITERATIONS = 20
 _AGAIN = 3  # times that a layer is looked for elsewhere, at most
 _DAMPED = 1e-3  # of the best seen component's information: a layer that is hardly seen stays where it is
-_CLOSE = 0.01  # m/s: a step this small is the last
+_CLOSE = 0.02  # m/s: a step this small is the last
 _CURVED = 0.2  # m/s: farther, derivatives are made anew
 _STRIDE = 4.0  # m/s: of an iteration, at most
 _FASTEST = 60.0  # m/s
@@ -87,8 +87,8 @@ def learn_winds(
 ) -> tuple[LayerWind, ...]:
     """The wind of each turbulent layer of a sky that is known but for its winds.
 
-    Layers that the sensors cannot separate should come merged into one: where two share what is measured, so do their
-    errors.
+    Layers that the sensors cannot separate are separated by their winds, if these differ. Errors suppose the layers'
+    strengths: what these lack of the truth, as those of such layers do, is in no error.
 
     Args:
         system: with the sky's r0, outer scale and layers as learned; its winds are not used.
@@ -122,6 +122,22 @@ def learn_winds(
     )
 
 
+def wind_of_all(layers: Sequence[LayerWind]) -> LayerWind:
+    """Of several layers together: their mean by strength, with the largest error that it can have.
+
+    Those that are not seen are left out, unless none is.
+    """
+    seen = [layer for layer in layers if not layer.reason] or list(layers)
+    share = np.array([layer.fraction for layer in seen])
+    share /= share.sum()
+    velocity = share @ np.array([layer.velocity for layer in seen])
+    sigma = share @ np.array([np.sqrt(np.diag(layer.covariance)) for layer in seen])
+    altitude = float(np.average([layer.altitude for layer in layers], weights=[layer.fraction for layer in layers]))
+    total = sum(layer.fraction for layer in layers)
+    covariance = seen[0].covariance if len(seen) == 1 else np.diag(sigma**2)
+    return LayerWind(altitude, total, (float(velocity[0]), float(velocity[1])), covariance, seen[0].reason)
+
+
 def with_winds(system: System, found: Sequence[LayerWind]) -> System:
     """The system with the winds that were found; layers whose wind is not seen keep theirs.
 
@@ -152,12 +168,17 @@ class _Slope:
     """How a lagged covariance changes with the winds.
 
     Attributes:
-        whitened: (n, n) derivatives by each component of each velocity, layer by layer, whitened.
-        information: (2 n_layers, 2 n_layers) their products with the derivatives.
+        derivatives: (n, n) by each component of each velocity, layer by layer.
+        whitened: the same, whitened.
     """
 
+    derivatives: list[Array]
     whitened: list[Array]
-    information: Array
+
+    @property
+    def information(self) -> Array:
+        """(2 n_layers, 2 n_layers) products of both."""
+        return np.array([[np.vdot(W, D) for D in self.derivatives] for W in self.whitened])
 
 
 class _Flow:
@@ -232,7 +253,10 @@ class _Flow:
         return best, found, taken
 
     def _elsewhere(self, velocities: Array) -> Array | None:
-        """The velocities with the layer moved that a place on the grid suits most better than its own; None: none."""
+        """The velocities with the layer moved that another place on the grid suits most better than its own.
+
+        None, if each is next to its best place.
+        """
         left = self._left(velocities, self._time)
         most, found = 0.0, None
         for l, velocity in enumerate(velocities):
@@ -240,7 +264,7 @@ class _Flow:
             alone = self._whitened(left + own)
             gain, there, _ = self._best(l, alone)
             more = gain - (2 * float(np.vdot(alone, own)) - float(np.vdot(self._whitened(own), own)))
-            if more > most:
+            if more > most and np.hypot(*(there - velocity)) > _SPEEDS[1]:
                 most, found = more, velocities.copy()
                 found[l] = there
         return found
@@ -261,41 +285,47 @@ class _Flow:
             (n_layers, 2) m/s, and what each lag is like about there.
         """
         velocities, at = velocities.copy(), np.full(velocities.shape, np.inf)
-        slopes: dict[float, _Slope] = {}
-        seen = np.ones(velocities.size)  # of each component, relative to the best: what is hardly seen decides nothing
+        blank = [self._C] * velocities.size  # every layer has moved at first
+        slopes = {time: _Slope(blank.copy(), blank.copy()) for time in self._measured}
+        seen = np.ones(velocities.shape)  # of each component, relative to the best: what is hardly seen decides nothing
+        stride, last = np.full(len(velocities), _STRIDE), np.zeros(velocities.shape)
         for _ in range(_ITERATIONS):
-            if (seen * np.abs(velocities - at).ravel()).max() > _CURVED:
-                at = velocities.copy()
-                slopes = {time: self._slope(at, time) for time in self._measured}
+            moved = np.flatnonzero((seen * np.abs(velocities - at)).max(axis=1) > _CURVED)
+            if len(moved):
+                at[moved] = velocities[moved]
+                for time, slope in slopes.items():
+                    for l in moved:
+                        both = self._derivatives(int(l), velocities[l], time)
+                        slope.derivatives[2 * l : 2 * l + 2] = both
+                        slope.whitened[2 * l : 2 * l + 2] = [self._whitened(D) for D in both]
                 information = np.sum([slope.information for slope in slopes.values()], axis=0)
                 diagonal = np.diag(information)
-                seen = np.sqrt(diagonal / diagonal.max())
+                seen = np.sqrt(diagonal / diagonal.max()).reshape(-1, 2)
                 ridge = np.diag(diagonal + diagonal.max()) * _DAMPED
             score = np.zeros(velocities.size)
             for time in self._measured:
                 left = self._left(velocities, time)
                 score += [np.vdot(W, left) for W in slopes[time].whitened]
-            step = np.linalg.solve(information + ridge, score)
-            step *= min(1.0, _STRIDE / max(float(np.abs(step).max()), 1e-9))
-            velocities += step.reshape(-1, 2)
+            step: Array = np.linalg.solve(information + ridge, score).reshape(-1, 2)
+            length = np.hypot(*step.T)
+            # a layer that goes to and fro has gone too far each time
+            back = np.sum(step * last, axis=1) < 0
+            stride = np.where(back, np.minimum(stride, length) / 2, np.minimum(1.5 * stride, _STRIDE))
+            step *= np.minimum(1, stride / np.maximum(length, 1e-9))[:, None]
+            last = step
+            velocities += step
             speed = np.hypot(*velocities.T)[:, None]
             velocities *= np.minimum(1, _FASTEST / np.maximum(speed, 1e-9))
             if (seen * np.abs(step)).max() < _CLOSE:
                 break
         return velocities, slopes
 
-    def _slope(self, velocities: Array, time: float) -> _Slope:
-        derivatives = self._derivatives(velocities, time)
-        whitened = [self._whitened(D) for D in derivatives]
-        return _Slope(whitened, np.array([[np.vdot(W, D) for D in derivatives] for W in whitened]))
-
-    def _derivatives(self, velocities: Array, time: float) -> list[Array]:
-        """Of the lagged covariance by each component of each velocity, layer by layer."""
+    def _derivatives(self, l: int, velocity: Array, time: float) -> list[Array]:
+        """Of the lagged covariance by each component of a layer's velocity."""
         out = []
-        for l, velocity in enumerate(velocities):
-            for axis in np.eye(2):
-                ahead, behind = (self._layer(l, velocity + s * _STEP * axis, time) for s in (1, -1))
-                out.append((ahead - behind) / (2 * _STEP))
+        for axis in np.eye(2):
+            ahead, behind = (self._layer(l, velocity + s * _STEP * axis, time) for s in (1, -1))
+            out.append((ahead - behind) / (2 * _STEP))
         return out
 
     def covariance(self, velocities: Array, slopes: Mapping[float, _Slope], pairs: int, interval: float) -> Array:

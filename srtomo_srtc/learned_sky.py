@@ -9,8 +9,8 @@ import numpy as np
 
 from srtomo_core.layout import Layout
 from srtomo_core.system import System
-from srtomo_srtc.learn import LIMIT, Learned, solve, winds_at
-from srtomo_srtc.learn_wind import LayerWind, learn_winds, with_winds
+from srtomo_srtc.learn import LIMIT, Group, Learned, solve, winds_at
+from srtomo_srtc.learn_wind import LayerWind, learn_winds, wind_of_all, with_winds
 from srtomo_srtc.telemetry import Statistics
 from srtomo_srtc.wind import winds as winds_of
 from srtomo_srtc.wind import with_trusted_winds
@@ -23,12 +23,18 @@ class LearnedSky:
     Attributes:
         learned: strengths and noise.
         system: the instrument under that sky.
-        winds: of each group of layers that holds turbulence; empty where they were not asked for.
+        winds: of each turbulent layer of ``system``; empty where they were not asked for.
     """
 
     learned: Learned
     system: System
     winds: tuple[LayerWind, ...] = ()
+
+    def wind_of(self, group: Group) -> LayerWind | None:
+        """Of the layers that are told as one, together; None where it was not asked for, or there is no turbulence."""
+        turbulent = np.flatnonzero(self.learned.fractions > 0)
+        layers = [wind for l, wind in zip(turbulent, self.winds) if l in group.layers]
+        return wind_of_all(layers) if layers else None
 
 
 def learned_sky(
@@ -44,9 +50,8 @@ def learned_sky(
 
     Args:
         system: the instrument as its file says.
-        winds: learn them too, one for layers that are told as one; each is believed as far as it is known, and where it
-            is not seen as the file has it. The errors of all else are those that go with these winds; without, with the
-            file's.
+        winds: learn them too, layer by layer; each is believed as far as it is known, and where it is not seen as the
+            file has it. The errors of all else are those that go with these winds; without, with the file's.
         layout: where sensors are taken to be; as in the system when not given.
         altitudes, limit: as :func:`~srtomo_srtc.learn.learn` has them.
 
@@ -59,15 +64,11 @@ def learned_sky(
     believed = learned.system(system, layout=layout)
     if not winds:
         return LearnedSky(learned, believed)
-    found = learn_winds(learned.system(system, layout=layout, merged=True), window, layout)
-    told = (group for group in learned.groups if group.fraction > 0)
-    of_layer = {l: wind for group, wind in zip(told, found, strict=True) for l in group.layers}
-    turbulent = np.flatnonzero(learned.fractions > 0)
-    each = [of_layer[int(l)] for l in turbulent]
-    believed = with_winds(believed, each)
+    found = learn_winds(believed, window, layout)
+    believed = with_winds(believed, found)
     velocity = winds_at(system, learned.altitudes)
-    velocity[turbulent] = winds_of(believed)
-    trusted = with_trusted_winds(believed, [0.0 if wind.reason else wind.sigma for wind in each])
+    velocity[learned.fractions > 0] = winds_of(believed)
+    trusted = with_trusted_winds(believed, [0.0 if wind.reason else wind.sigma for wind in found])
     return LearnedSky(solution.told(velocity), trusted, found)
 
 

@@ -42,9 +42,9 @@ def learned_fields(system: System, sky: LearnedSky, window: Statistics) -> dict[
     """
     learned, groups = sky.learned, sky.learned.groups
     winds, wind_error = winds_at(system, np.array([group.altitude for group in groups])), np.full(len(groups), math.nan)
-    told = [g for g, group in enumerate(groups) if group.fraction > 0]
-    for g, wind in zip(told, sky.winds):  # none where they were not asked for
-        if not wind.reason:
+    for g, group in enumerate(groups):
+        wind = sky.wind_of(group)
+        if wind is not None and not wind.reason:
             winds[g], wind_error[g] = wind.velocity, wind.sigma
     speed = np.hypot(*winds.T)
     low, high = learned.outer_scale_range

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 import time
-from collections.abc import Mapping
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ from srtomo_core.layout import Layout
 from srtomo_core.reconstructor import load_interaction_matrix
 from srtomo_core.system import System
 from srtomo_ops.options import add_registration, writable_file, write_json
-from srtomo_srtc.learn import LIMIT, Group, Learned
+from srtomo_srtc.learn import LIMIT, Learned
 from srtomo_srtc.learn_wind import LayerWind
 from srtomo_srtc.learned_sky import lags_of, learned_sky
 from srtomo_srtc.mirrors import interaction_matrix
@@ -44,7 +44,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help="of the layers, m above the telescope, ascending; errors suppose that all turbulence is there "
         "(default: a grid as fine as the stars can tell, with turbulence in between allowed for in the errors)",
     )
-    parser.add_argument("--winds", action="store_true", help="learn the wind of each group of layers too")
+    parser.add_argument("--winds", action="store_true", help="learn the wind of each layer too")
     parser.add_argument(
         "--interaction-matrix",
         metavar="FILE",
@@ -86,8 +86,7 @@ def main(options: argparse.Namespace) -> int:
     sky = learned_sky(
         system, statistics, winds=options.winds, layout=layout, altitudes=options.altitudes, limit=options.slopes
     )
-    learned = sky.learned
-    winds = dict(zip((group for group in learned.groups if group.fraction > 0), sky.winds))
+    learned, winds = sky.learned, sky.winds
     seconds = time.perf_counter() - start
     supposed = BETWEEN if options.altitudes is None else ONLY_AT
     _print(system, statistics, learned, winds, supposed)
@@ -117,9 +116,7 @@ def _statistics(reader: BagReader, system: System, layout: Layout, matrix: Path 
     return statistics
 
 
-def _print(
-    system: System, statistics: Statistics, learned: Learned, winds: Mapping[Group, LayerWind], supposed: str
-) -> None:
+def _print(system: System, statistics: Statistics, learned: Learned, winds: Sequence[LayerWind], supposed: str) -> None:
     low, high = learned.outer_scale_range
     seen = f"{low:.0f} to {high:.0f} m" if math.isfinite(high) else f"above {low:.0f} m"
     print(
@@ -137,18 +134,16 @@ def _print(
     print(f"  {supposed}")
     if winds:
         print(f"  {'altitude [m]':<18} {'wind [m/s]':>14} {'going to [deg from +x]':>26}")
-    for group, wind in reversed(list(winds.items())):
+    for wind in reversed(winds):
         turn = f"{math.degrees(wind.direction):4.0f} +- {math.degrees(wind.sigma / max(wind.speed, wind.sigma)):.0f}"
         told = wind.reason or f"{wind.speed:6.1f} +- {wind.sigma:.1f} {turn:>26}"
-        print(f"  {group.altitude:<18.0f} {told}")
+        print(f"  {wind.altitude:<18.0f} {told}")
     print("  noise variance over that of the instrument file")
     for level in learned.noise:
         print(f"  {system.sensors[level.sensor].name:<18} {level.factor:6.3f} +- {level.sigma:.3f}")
 
 
-def _numbers(
-    system: System, statistics: Statistics, learned: Learned, winds: Mapping[Group, LayerWind]
-) -> dict[str, Any]:
+def _numbers(system: System, statistics: Statistics, learned: Learned, winds: Sequence[LayerWind]) -> dict[str, Any]:
     low, high = learned.outer_scale_range
     return {
         "system": system.name,
@@ -169,10 +164,10 @@ def _numbers(
                 "fraction": group.fraction,
                 "sigma": group.sigma,
                 "reason": group.reason,
-                **(_wind(winds[group]) if group in winds else {}),
             }
             for group in learned.groups
         ],
+        "winds": [{"altitude_m": wind.altitude, "fraction": wind.fraction, **_wind(wind)} for wind in winds],
         "noise": [
             {"sensor": system.sensors[level.sensor].name, "variance_factor": level.factor, "sigma": level.sigma}
             for level in learned.noise
@@ -182,9 +177,9 @@ def _numbers(
 
 def _wind(wind: LayerWind) -> dict[str, Any]:
     if wind.reason:
-        return {"wind_reason": wind.reason}
+        return {"reason": wind.reason}
     return {
-        "wind_speed_mps": wind.speed,
-        "wind_direction_deg": math.degrees(wind.direction),
-        "wind_sigma_mps": wind.sigma,
+        "speed_mps": wind.speed,
+        "direction_deg": math.degrees(wind.direction),
+        "sigma_mps": wind.sigma,
     }

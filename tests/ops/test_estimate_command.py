@@ -44,10 +44,11 @@ def test_a_bag_s_sky(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     assert [level["sensor"] for level in sky["noise"]] == ["lgs1", "lgs2", "lgs3"]
     assert 0.7 < min(level["variance_factor"] for level in sky["noise"])
     # the winds that the bag was recorded with
-    for group, layer in zip(sky["groups"], load_system("mini").atmosphere.layers, strict=True):
-        off = cmath.rect(group["wind_speed_mps"], math.radians(group["wind_direction_deg"]))
+    for wind, layer in zip(sky["winds"], load_system("mini").atmosphere.layers, strict=True):
+        assert wind["altitude_m"] == layer.altitude
+        off = cmath.rect(wind["speed_mps"], math.radians(wind["direction_deg"]))
         off -= cmath.rect(layer.wind_speed, layer.wind_direction)
-        assert abs(off) < 3 * group["wind_sigma_mps"] < 2
+        assert abs(off) < 3 * wind["sigma_mps"] < 2
     out = capsys.readouterr().out
     assert "errors suppose that all turbulence is at these altitudes" in out
     assert f"{100 * sky['r0_m']:.2f} +- {100 * sky['r0_sigma_m']:.2f} cm" in out

@@ -278,5 +278,5 @@ def test_registration_from_30_s_of_closed_loop(seed: int, direction: float) -> N
         )
         after = _wfe(swapped, swap + 100, end)
         print(f"WFE {1e9 * before:.2f} nm before, {1e9 * after:.2f} after the swap, {1e9 * best:.2f} told the truth")
-        assert before > 1.05 * best
+        assert before > 1.02 * best  # that there is something to win back
         assert after < 1.02 * best

@@ -59,7 +59,8 @@ def learned(outer_scale_range: tuple[float, float] = (15.0, 28.0)) -> Learned:
 
 def test_a_learned_sky(mini: System, window: Statistics) -> None:
     winds = (
-        LayerWind(500.0, 0.7, (8.0, 0.0), np.diag([0.04, 0.01]), ""),
+        LayerWind(0.0, 0.5, (8.0, 0.0), np.diag([0.04, 0.01]), ""),
+        LayerWind(1000.0, 0.2, (1.0, 0.0), np.diag([0.81, 0.01]), ""),
         LayerWind(9000.0, 0.3, (0.0, 7.0), np.diag([9.0, 9.0]), "not seen"),
     )
     message = sent("AtmosphereProfile", learned_fields(mini, LearnedSky(learned(), mini, winds), window))
@@ -71,9 +72,10 @@ def test_a_learned_sky(mini: System, window: Statistics) -> None:
     assert message.noise == pytest.approx([2.0, math.nan, 1.0, math.nan], nan_ok=True)
     assert message.noise_error == pytest.approx([0.1, math.nan, 0.05, math.nan], nan_ok=True)
     # what is not seen is supposed to be the file's
-    assert message.wind_speed[0] == pytest.approx(8.0)
-    assert message.wind_speed_error[0] == pytest.approx(0.2)
-    assert message.wind_direction_error[0] == pytest.approx(0.2 / 8.0)
+    # of two that are told as one the mean by strength, whose error is largest where theirs go together
+    assert message.wind_speed[0] == pytest.approx(6.0)
+    assert message.wind_speed_error[0] == pytest.approx(0.4)
+    assert message.wind_direction_error[0] == pytest.approx(0.4 / 6.0)
     assert message.wind_speed[1] > 10 and math.isnan(message.wind_speed_error[1])
 
 
