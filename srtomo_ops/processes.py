@@ -11,6 +11,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
+_OWN_GROUP: dict[str, Any] = {"process_group": 0} if sys.version_info >= (3, 11) else {"preexec_fn": os.setpgrp}
+
 
 class NodeError(ValueError):
     """A node that ended before its time; one line with the last thing it said."""
@@ -33,13 +35,14 @@ class Processes:
     def start(self, name: str, words: list[str], module: str = "srtomo_ops.cli") -> None:
         """Start ``srtomo WORDS...`` under a name, or another module with these words."""
         with open(self.log(name), "wb") as log:
-            # a session of its own: Ctrl-C goes to the supervisor, which ends the nodes in order
+            # a group of its own: Ctrl-C goes to the supervisor, which ends the nodes in order. No session of its own:
+            # Linux shares cores among sessions first, and the SRTC's SCHED_IDLE would count among its threads alone
             self._running[name] = subprocess.Popen(
                 [sys.executable, "-m", module, *words],
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=subprocess.STDOUT,
-                start_new_session=True,
+                **_OWN_GROUP,
                 env={**os.environ, "PYTHONUNBUFFERED": "1"},
             )
 

@@ -25,7 +25,9 @@ def test_nodes_end_with_the_process_that_started_them(start_process: Any, how: s
     while not (told := process.output.split()):
         time.sleep(0.02)
     node = int(told[0])
-    os.kill(node, 0)
+    # where Ctrl-C does not go, and among whose tasks SCHED_IDLE counts
+    assert os.getpgid(node) == node
+    assert os.getsid(node) == os.getsid(process.pid)
     assert getattr(process, how)() != 0
     with pytest.raises(ProcessLookupError):
         os.kill(node, 0)
