@@ -10,8 +10,10 @@ says whether the difference is worth anything. What each number stops:
 - too few frames, or too alike: errors by jackknife over blocks of frames, and the number of blocks;
 - a better model that would not change the commands much: the predicted gain;
 - a swap on data that no longer hold, or a matrix that is not what its model promises: the watch afterwards, by the same
-  numbers on new frames, and by what the loop leaves of the slopes; once that is passed, as long as there is a way back,
-  by the rule of every swap: both numbers.
+  numbers on new frames, and by what the loop leaves of the slopes; once that is passed, or after a roll-back, as long
+  as there is a way back, by the rule of every swap: both numbers;
+- several swaps on data that no longer hold: the way back is as long as the same numbers make it;
+- flapping between models that both explain what is measured: a pause after a roll-back.
 """
 
 from __future__ import annotations
@@ -39,7 +41,7 @@ class Rules:
         floor: m rms, by which the wavefront error has to fall.
         every: s, from one swap to the next at least.
         watch: s, how long a new reconstructor is watched closely.
-        pause: s, from a roll-back to the next swap.
+        pause: s, from a roll-back to the next swap, unless what runs does not explain its sensors.
         errors: standard errors by which held-out frames have to prefer a model.
         tolerance: how far the innovation of a sensor that others foretell may be from 1, as a factor less 1.
         left: factor by which the share of the slopes that the loop leaves may grow with a swap.
@@ -122,10 +124,11 @@ class Action(enum.Enum):
 
 @dataclass(frozen=True)
 class Decision:
-    """What to do, and why; for people, and for the bag."""
+    """What to do, and why; for people, and for the bag. ``steps``: how far back, of a roll-back."""
 
     action: Action
     reason: str
+    steps: int = 0
 
 
 class Decider:
@@ -163,9 +166,13 @@ class Decider:
             self._state = State.IDLE
         return self._state
 
-    def hindrance(self) -> str:
-        """Why no swap can be made now, whatever a fit finds; empty when one can."""
-        if self.state is State.PAUSED:
+    def hindrance(self, ill: str = "") -> str:
+        """Why no swap can be made now, whatever a fit finds; empty when one can.
+
+        Args:
+            ill: of the active model, since it runs, as :meth:`ill` gives it: no pause is for what is wrong.
+        """
+        if self.state is State.PAUSED and not ill:
             return f"rolled back {self._clock() - self._since:.0f} s ago, waiting {self.rules.pause:g} s"
         if (since := self._clock() - self._swapped) < self.rules.every:
             return f"the last swap was {since:.0f} s ago, one every {self.rules.every:g} s is allowed"
@@ -199,17 +206,18 @@ class Decider:
                 return Decision(Action.KEEP, reason)
         return Decision(Action.COMMIT, f"held-out frames prefer the candidate: {comparison.text}")
 
-    def gains(self, preference: Decision, before: float, after: float) -> Decision:
+    def gains(self, preference: Decision, before: float, after: float, ill: str = "") -> Decision:
         """Whether what held-out frames prefer is worth a swap; if so, the time to the next one begins.
 
         Args:
             preference: of :meth:`prefers`, in favour.
             before, after: wavefront error of the active and of the new reconstructor under the learned sky, m rms.
+            ill: as :meth:`hindrance` takes it.
         """
         predicted = f"predicted {before * 1e9:.1f} -> {after * 1e9:.1f} nm"
         if not before - after >= self.rules.floor:
             return Decision(Action.KEEP, f"{predicted}, less than {self.rules.floor * 1e9:g} nm better")
-        if hindrance := self.hindrance():
+        if hindrance := self.hindrance(ill):
             return Decision(Action.KEEP, f"{predicted}, but {hindrance}")
         self._swapped = self._clock()
         return Decision(Action.COMMIT, f"{preference.reason}; {predicted}")
@@ -222,24 +230,40 @@ class Decider:
         """
         self._state, self._since, self._left_before = State.WATCHING, self._clock(), left
 
-    def watch(self, comparison: Comparison, explained: Array, left: Estimate) -> Decision:
-        """Judge the reconstructor that was committed last by frames since.
-
-        While it is watched one number that speaks for the one before is enough; later both have to. The pause begins
-        with the decision.
+    def worse(self, comparison: Comparison, closely: bool) -> str:
+        """The numbers by which a model is worse than one before, if they are enough to go back; otherwise empty.
 
         Args:
-            comparison: of the new model, as the candidate, with the one before.
-            explained: of the new model, as :meth:`ill` takes it.
+            comparison: of the model, as the candidate, with the one before.
+            closely: a swap is being watched: one number is enough. Later, and after a roll-back, it takes both.
+        """
+        found = [name for name, difference in comparison.differences if difference.significance <= -self.rules.errors]
+        enough = closely or len(found) == len(comparison.differences)
+        return " and ".join(found) if enough else ""
+
+    def watch(
+        self, comparison: Comparison, explained: Array, left: Estimate, older: Sequence[Comparison] = ()
+    ) -> Decision:
+        """Judge the reconstructor that the loop runs by frames since.
+
+        The pause begins with the decision.
+
+        Args:
+            comparison: of its model, as the candidate, with the one before.
+            explained: of its model, as :meth:`ill` takes it.
             left: as :meth:`committed` takes it, now. Where the model no longer explains the slopes, it is the sky or
                 the light that has changed, and this share with it: then it says nothing of the reconstructor.
+            older: of its model with those before that, latest first: the one before may be as wrong as it is. These
+                always take both numbers.
         """
-        rules = self.rules
-        worse = [name for name, difference in comparison.differences if difference.significance <= -rules.errors]
-        if self.state is not State.WATCHING and len(worse) < len(comparison.differences):
+        rules, closely = self.rules, self.state is State.WATCHING
+        if worse := self.worse(comparison, closely):
+            return self._roll_back(f"by its {worse} the one before is better: {comparison.text}")
+        for steps, other in enumerate(older, 2):
+            if worse := self.worse(other, closely=False):
+                return self._roll_back(f"by its {worse} the one {steps} steps before is better: {other.text}", steps)
+        if not closely:
             return Decision(Action.KEEP, f"no worse than the one before: {comparison.text}")
-        if worse:
-            return self._roll_back(f"by its {' and '.join(worse)} the one before is better: {comparison.text}")
         grown = left.mean - rules.errors * left.error > rules.left * self._left_before
         if grown and not self.ill(comparison.candidate, explained):
             return self._roll_back(
@@ -260,6 +284,6 @@ class Decider:
         if self.state is State.WATCHING:
             self._state = State.IDLE
 
-    def _roll_back(self, reason: str) -> Decision:
+    def _roll_back(self, reason: str, steps: int = 1) -> Decision:
         self._state, self._since = State.PAUSED, self._clock()
-        return Decision(Action.ROLL_BACK, f"roll back: {reason}")
+        return Decision(Action.ROLL_BACK, f"roll back: {reason}", steps)

@@ -3,7 +3,9 @@
 Every window is fitted; what the fit believes is compared with what the loop runs on, on frames that the fit has not
 seen; and what is better by :mod:`srtomo_srtc.decide`'s rules becomes a reconstructor. Whoever calls this publishes and
 commits it, and says what the loop runs (:meth:`Learner.running`). What runs is judged by the latest frames apart from
-that, without a fit; a swap that was asked for is watched so, and taken back, for as long as there is a way back.
+that, without a fit; a swap that was asked for is watched so, and taken back, for as long as there is a way back. What
+it replaced, and what that had replaced, are ways back: of two swaps in a cloud the second is wrong when the light is
+back, and so is the first.
 """
 
 from __future__ import annotations
@@ -73,13 +75,14 @@ class Judgement:
     Attributes:
         window: the telemetry that was judged.
         active: what the loop ran; None when it is nothing of ours.
-        outcome: PUBLISHED asks for ``candidate`` to be published and committed, ROLLED_BACK for ``previous`` to be
-            rolled back to.
+        previous: the nearest way back from it, or the one that is to be gone back to; None where there is none.
+        outcome: PUBLISHED asks for ``candidate`` to be published and committed, ROLLED_BACK for the loop to go back to
+            ``previous``, which may be older than what the HRTC kept.
         reason: for people.
         health: of the active model.
         sky: that was learned, unless the fit failed.
         comparison: of the candidate with the active model.
-        watched: of the active model with the one before, while a swap is watched.
+        watched: of the active model with the one before, where there is a way back.
         candidate: built where held-out frames prefer the learned sky.
         predicted: wavefront error of the active and of the candidate's reconstructor under the learned sky, m rms.
         seconds: that the stages took.
@@ -130,6 +133,7 @@ def _timed(judgement: Judgement, stage: str) -> Iterator[None]:
     judgement.seconds[stage] = round(time.perf_counter() - since, 3)
 
 
+_LATEST = 2  # ways back that are kept, besides the oldest
 _DROPPED = "dropped: the loop was given another reconstructor meanwhile"
 
 Fit = Callable[[Statistics], LearnedSky]
@@ -171,8 +175,9 @@ class Learner:
         self.decider = Decider(self._sensors, rules, clock)
         self._known: dict[int, Belief] = {}
         self._active: Belief | None = None
-        self._previous: Belief | None = None
-        self._ours = False  # the active one was asked for here, and the one before is the way back
+        # what the swaps that were asked for here replaced, oldest first; none where somebody else chose what is active
+        self._ways_back: tuple[Belief, ...] = ()
+        self._going_back = False  # was asked for, and the loop has not done it yet
         self._offered = 0
         self._left = np.inf
         # of all of the above; never held while something is computed
@@ -189,35 +194,45 @@ class Learner:
             if self._active is not None and identity == self._active.reconstructor.id:
                 return
             before, self._active = self._active, self._known.get(identity)
-            back = self._ours and self._previous is not None and identity == self._previous.reconstructor.id
-            self._ours = not back and identity == self._offered and before is not None
+            self._going_back = False
+            ways = self._ways_back
+            back = [step for step, belief in enumerate(ways) if belief.reconstructor.id == identity]
             if back:
+                self._ways_back = ways[: back[0]]
+                if before is not None and before.reconstructor.id == self._offered:
+                    self._offered = 0  # whoever takes it up again has chosen it
                 self.decider.rolled_back()
-            elif self._ours:
+            elif identity == self._offered and before is not None:
+                # the oldest is what people chose
+                self._ways_back = (*ways[:1], *(*ways[1:], before)[-_LATEST:]) if ways else (before,)
                 self.decider.committed(self._left)
             else:
+                self._ways_back = ()
                 self.decider.left_alone()
-            self._previous = before
             if self._active is None:
                 return  # the HRTC may have nothing yet, and come to what is known here
-            needed = {belief.reconstructor.id for belief in (self._active, before) if belief is not None}
+            # the one before, which is no way back where it was gone back from, is still the HRTC's previous one
+            kept = (self._active, before, *self._ways_back)
+            needed = {belief.reconstructor.id for belief in kept if belief is not None}
             needed.add(self._offered)
             self._known = {
                 known: belief for known, belief in self._known.items() if known in needed or belief.source != "learned"
             }
 
     def watch(self, recent: Recent) -> Judgement | None:
-        """Judge what the loop runs by the latest frames, and a swap that was asked for here by those since.
+        """Judge what the loop runs by the latest frames, and a swap that was asked for here at first by those since.
 
-        Two products a model and frame, once the models are there.
+        Two products a model and frame, once the models are there: of what runs, and of each way back.
 
         Returns:
-            with the health of the active model; ROLLED_BACK where the one before is better. None: there are too few
+            with the health of the active model; ROLLED_BACK, once, where a way back is better. None: there are too few
             frames, or what is active is not known here or has just changed.
         """
         with self._lock:
-            active, previous = self._active, self._previous
-            watching = self._ours and self.decider.state is not State.PAUSED
+            active, ways = self._active, self._ways_back
+            closely = self.decider.state is State.WATCHING
+            asked = self._going_back and self.decider.state is State.PAUSED
+        previous = ways[-1] if ways else None
         held = recent.held_out
         if active is None or len(np.unique(held.block)) < FEWEST_BLOCKS:
             return None
@@ -226,28 +241,42 @@ class Learner:
         health = judgement.health = Health.of(model.scores(held.slopes), held.block)
         ill = self.decider.ill(health, model.explained)
         judgement.reason = f"the active model {f'does not explain {ill}' if ill else 'explains its sensors'}"
-        if not watching or previous is None:
+        if asked or previous is None:
             return judgement
-        since = held.reconstructor == active.reconstructor.id
-        if len(np.unique(held.block[since])) < FEWEST_BLOCKS:
+        some = np.ones(len(held.frames), bool)
+        if closely:
+            some = held.reconstructor == active.reconstructor.id
+        # after a roll-back all: open-loop slopes are the same whatever answered them, and a step farther may be urgent
+        if len(np.unique(held.block[some])) < FEWEST_BLOCKS:
             return judgement.ended(Outcome.KEPT, f"watching: too few frames since the swap; {judgement.reason}")
         try:
-            judgement.watched = self._compared(model, previous.model(self._ahead), held, since)
+            judgement.watched, *older = (
+                self._compared(model, way.model(self._ahead), held, some) for way in reversed(ways)
+            )
         except ValueError as error:  # of frames in pairs there may be fewer
             return judgement.ended(Outcome.KEPT, f"watching: {error}; {judgement.reason}")
-        left = left_by_loop(held, since)
+        left = left_by_loop(held, some)
         with self._lock:
             if self._active is not active:
                 return None
-            decision = self.decider.watch(judgement.watched, model.explained, left)
-        back = decision.action is Action.ROLL_BACK
-        return judgement.ended(Outcome.ROLLED_BACK if back else Outcome.KEPT, decision.reason)
+            decision = self.decider.watch(judgement.watched, model.explained, left, older)
+            self._going_back = decision.action is Action.ROLL_BACK
+        if decision.action is not Action.ROLL_BACK:
+            return judgement.ended(Outcome.KEPT, decision.reason)
+        judgement.ended(Outcome.ROLLED_BACK, decision.reason)
+        judgement.previous = target = ways[-decision.steps]
+        for steps, way in enumerate(reversed(ways[: -decision.steps]), decision.steps + 1):
+            comparison = self._compared(target.model(self._ahead), way.model(self._ahead), held, some)
+            if worse := self.decider.worse(comparison, closely):
+                judgement.previous = target = way
+                judgement.reason += f"; {steps} steps back, better still by its {worse}: {comparison.text}"
+        return judgement
 
     def judge(self, window: Statistics) -> Judgement:
         """Fit a window and decide. Takes seconds to minutes, and as much memory as a few covariances of slopes."""
         with self._lock:
             active = self._active
-            judgement = Judgement(window, active, self._previous)
+            judgement = Judgement(window, active, self._ways_back[-1] if self._ways_back else None)
         if active is None:
             return judgement.ended(Outcome.FAILED, "the loop runs no reconstructor whose model is known here")
         held = window.held_out
@@ -266,10 +295,10 @@ class Learner:
         with self._lock:
             if self._active is judgement.active:
                 return True
-            if self._active is None or not self._ours or self._previous is not judgement.active:
+            if self._active is None or not self._ways_back or self._ways_back[-1] is not judgement.active:
                 return False
             active = judgement.active = self._active
-            judgement.previous = self._previous
+            judgement.previous = self._ways_back[-1]
         judgement.health = Health.of(active.model(self._ahead).scores(held.slopes), held.block)
         return True
 
@@ -316,12 +345,17 @@ class Learner:
             before, after = (mean_wfe(prediction.budgets(reconstructor.R)) for reconstructor in two)
         judgement.predicted = before, after
         running = held.reconstructor == active.reconstructor.id
-        enough = len(np.unique(held.block[running])) > 1
-        left = float(left_by_loop(held, running).mean) if enough else np.inf
+        blocks = len(np.unique(held.block[running]))
+        left = float(left_by_loop(held, running).mean) if blocks > 1 else np.inf
+        ill = ""
+        if blocks >= FEWEST_BLOCKS:
+            active_model = active.model(self._ahead)
+            health = Health.of(active_model.scores(held.slopes[running]), held.block[running])
+            ill = self.decider.ill(health, active_model.explained)
         with self._lock:
             if self._active is not active:
                 return judgement.ended(Outcome.KEPT, _DROPPED)
-            decision = self.decider.gains(preference, before, after)
+            decision = self.decider.gains(preference, before, after, ill)
             if decision.action is not Action.COMMIT:
                 return judgement.ended(Outcome.KEPT, decision.reason)
             judgement.candidate = candidate

@@ -391,9 +391,12 @@ class SrtcNode(Node):
         if judgement.outcome is Outcome.PUBLISHED and candidate is not None:
             self._built[_LEARNED] = candidate
             self._send(candidate.reconstructor)
-            self._give_order(Order(candidate.reconstructor, False, instead, until))
+            self._give_order(Order(candidate.reconstructor, instead, until, published=True))
         elif judgement.outcome is Outcome.ROLLED_BACK and judgement.previous is not None:
-            self._give_order(Order(judgement.previous.reconstructor, True, instead, until))
+            target = judgement.previous
+            # blocks that the HRTC misses are asked for by id
+            self._built[target.source] = target
+            self._give_order(Order(target.reconstructor, instead, until, back=True))
 
     def _told(self, level: int, reason: str) -> None:
         """Say it from now on in the diagnostics, and once in the log; ``level``: 0 OK, 1 WARN, 2 ERROR."""
@@ -411,6 +414,8 @@ class SrtcNode(Node):
                 self._told(2, f"could not {self._order.text}: the HRTC does not hold it")
             self._order = order
         else:
+            if self._next(order) is Step.PUBLISH:
+                self._send(order.reconstructor)
             self.get_logger().info(f"auto_commit is off: to {order.text} is the operator's")
 
     def _pursue(self) -> None:
@@ -418,12 +423,15 @@ class SrtcNode(Node):
         order, status = self._order, self._status
         if order is None or status is None or order.called:
             return
-        step = order.step(status.reconstructor, status.staged, status.previous, time.monotonic())
-        if step is Step.CALL:
+        step = self._next(order)
+        if step in (Step.COMMIT, Step.ROLL_BACK):
             order.called = True
-            client = self._roll_back if order.roll_back else self._commit
+            client = self._roll_back if step is Step.ROLL_BACK else self._commit
             request = SwapReconstructor.Request(id=order.reconstructor.id, sha256=list(order.reconstructor.sha256))
-            client.call_async(request).add_done_callback(partial(self._swapped, order))
+            client.call_async(request).add_done_callback(partial(self._swapped, order, step))
+        elif step is Step.PUBLISH:
+            order.published = True
+            self._send(order.reconstructor)
         elif step is not Step.WAIT:
             self._order = None
             if step is Step.DROP:
@@ -431,9 +439,20 @@ class SrtcNode(Node):
             elif step is Step.FAIL:
                 self._told(2, f"could not {order.text}: the HRTC does not hold it")
 
-    def _swapped(self, order: Order, future: Future) -> None:
-        self._order = None
+    def _next(self, order: Order) -> Step:
+        """By the HRTC's latest status."""
+        status = self._status
+        if status is None:
+            return Step.WAIT
+        return order.step(status.reconstructor, status.staged, status.previous, time.monotonic())
+
+    def _swapped(self, order: Order, step: Step, future: Future) -> None:
         response = future.result()
+        if step is Step.ROLL_BACK and not (response is not None and response.success):
+            order.refused, order.called = True, False  # the status was of before another swap
+            return
+        if self._order is order:
+            self._order = None
         if response is not None and response.success:
             self.get_logger().info(f"{order.text}: from frame {response.first_frame} on")
         else:

@@ -12,7 +12,9 @@ class Step(enum.Enum):
     """What is to be done about an order."""
 
     WAIT = "wait"
-    CALL = "call"
+    PUBLISH = "publish"
+    COMMIT = "commit"
+    ROLL_BACK = "roll back"
     DONE = "done"
     DROP = "drop"
     FAIL = "fail"
@@ -24,22 +26,26 @@ class Order:
 
     Attributes:
         reconstructor: that the loop is to run.
-        roll_back: to the HRTC's previous reconstructor; otherwise a commit of its staged one.
         instead: id of the reconstructor that was judged, and that alone is to be replaced.
         until: when it is given up, s of the monotonic clock.
+        back: to what the loop ran before; the HRTC keeps one such, and any older one has to be published again.
+        published: the HRTC was sent it.
         called: the HRTC was asked.
+        refused: to roll back was refused: what it kept was another one by then.
     """
 
     reconstructor: Reconstructor
-    roll_back: bool
     instead: int
     until: float
+    back: bool = False
+    published: bool = False
     called: bool = False
+    refused: bool = False
 
     @property
     def text(self) -> str:
         """What it is."""
-        return f"{'roll back to' if self.roll_back else 'commit'} {self.reconstructor.id:016x}"
+        return f"{'go back to' if self.back else 'commit'} {self.reconstructor.id:016x}"
 
     def step(self, running: int, staged: int, previous: int, now: float) -> Step:
         """What is to be done.
@@ -55,6 +61,10 @@ class Order:
             return Step.DONE
         if running != self.instead:
             return Step.DROP
-        if self.reconstructor.id == (previous if self.roll_back else staged):
-            return Step.CALL
+        if self.reconstructor.id == previous and not self.refused:
+            return Step.ROLL_BACK
+        if self.reconstructor.id == staged:
+            return Step.COMMIT
+        if not self.published:
+            return Step.PUBLISH
         return Step.FAIL if now > self.until else Step.WAIT

@@ -279,6 +279,33 @@ def test_the_watch_rolls_back(judge: Decider, clock: Clock, comparison: Comparis
     assert judge.gains(PREFERRED, 100e-9, 90e-9).action is Action.COMMIT
 
 
+def test_no_pause_is_for_a_model_that_explains_nothing(judge: Decider, clock: Clock) -> None:
+    ill = judge.ill(made_up(0, 0, innovation=0.2).candidate, EXPLAINED)
+    assert ill.startswith("a at 0.20 +- 0.01, ")
+    judge.rolled_back()
+    assert judge.gains(PREFERRED, 100e-9, 90e-9).action is Action.KEEP
+    assert judge.gains(PREFERRED, 100e-9, 90e-9, ill).action is Action.COMMIT
+    judge.committed(0.1)
+    judge.rolled_back()
+    assert "the last swap was 0 s ago" in judge.gains(PREFERRED, 100e-9, 90e-9, ill).reason
+
+
+def test_a_step_farther_back_takes_both_numbers(judge: Decider) -> None:
+    judge.committed(0.1)
+    judge.rolled_back()
+    for comparison in (made_up(-9, 1), made_up(1, -9), made_up(-9, -2.9)):
+        assert judge.watch(comparison, EXPLAINED, estimate(0.9, 0.01)).action is Action.KEEP
+    assert judge.watch(made_up(-4, -4), EXPLAINED, estimate(0.1, 0.01)).action is Action.ROLL_BACK
+
+
+def test_an_older_one_takes_both_numbers(judge: Decider) -> None:
+    judge.committed(0.1)
+    same, left = made_up(0, 0), estimate(0.1, 0.01)
+    assert judge.watch(same, EXPLAINED, left, [made_up(-9, 1), made_up(1, -9)]).action is Action.KEEP
+    decision = judge.watch(same, EXPLAINED, left, [made_up(-9, 1), made_up(-4, -4)])
+    assert (decision.action, decision.steps) == (Action.ROLL_BACK, 3)
+
+
 def test_what_an_operator_commits_is_not_watched(judge: Decider) -> None:
     judge.committed(0.1)
     judge.left_alone()

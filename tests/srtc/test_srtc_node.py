@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -22,13 +23,15 @@ pytest.importorskip("rclpy", reason="needs rclpy: pip install '.[ros]', or sourc
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from msgs_schema.msg import DmCommand, HrtcStatus, ModelHealth, SlopeFrame
+from msgs_schema.msg import Reconstructor as ReconstructorMsg
+from msgs_schema.srv import PublishReconstructor, SwapReconstructor
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
 import srtomo_srtc.node
 from srtomo_srtc.learn import LearnError
-from srtomo_srtc.learner import Judgement, Outcome
+from srtomo_srtc.learner import Belief, Judgement, Outcome
 from srtomo_srtc.listener import Listener
 from srtomo_srtc.node import SrtcNode
 from srtomo_srtc.reconstructors import implicit
@@ -64,15 +67,33 @@ class Loop:
             lambda m: self.diagnostics.extend((int.from_bytes(s.level, "little"), s.message) for s in m.status),
         )
         self._frame, self._rng = 0, np.random.default_rng(1)
-        self.reconstructor = 0  # 0: the file's
+        # what the HRTC holds, by id; 0: nothing, or the file's running
+        self.reconstructor = self.staged = self.previous = 0
+        self.swaps: list[tuple[str, int]] = []
+        self.refuses_to_roll_back = False
+        self._subscribe(ReconstructorMsg, wire.RECONSTRUCTOR, self._stage)
+        for service in ("commit", "roll_back"):
+            self.node.create_service(SwapReconstructor, f"hrtc/{service}", partial(self._swap, service))
 
     def _subscribe(self, kind: type, topic: wire.Topic, call: Callable[[Any], None]) -> None:
         self.node.create_subscription(kind, topic.name, call, QoSProfile(**topic.qos()))
 
+    def _stage(self, manifest: ReconstructorMsg) -> None:
+        self.staged = manifest.id
+
+    def _swap(
+        self, service: str, request: SwapReconstructor.Request, response: SwapReconstructor.Response
+    ) -> SwapReconstructor.Response:
+        self.swaps.append((service, request.id))
+        response.success = not (self.refuses_to_roll_back and service == "roll_back")
+        if response.success:
+            self.reconstructor, self.previous = request.id, self.reconstructor
+        return response
+
     def run(self, seconds: float, sensors: int | None = 0b1111) -> None:
         """Frames at 200 Hz, answered with some sensors; None: no frames."""
         reconstructor = self.reconstructor or self.srtc._built["file"].reconstructor.id
-        self._status.publish(HrtcStatus(reconstructor=reconstructor))
+        self._status.publish(HrtcStatus(reconstructor=reconstructor, staged=self.staged, previous=self.previous))
         for frame in range(self._frame, self._frame + (0 if sensors is None else round(200 * seconds))):
             for writer in self._sensors:
                 writer.values[:] = 1e-6 * self._rng.standard_normal(len(writer.values))
@@ -186,6 +207,38 @@ def test_health_is_live_while_a_fit_goes_on(loop: Loop, monkeypatch: pytest.Monk
         assert (srtc._order is None) == dropped
     assert srtc._reason == (0, "better; dropped: the loop runs 0000000000000005")
     over.set()
+
+
+@pytest.mark.parametrize("kept", ["the target", "another", "the target, by a status of before another swap"])
+def test_the_loop_goes_back_to_what_the_hrtc_kept_or_not(loop: Loop, kept: str) -> None:
+    """What it kept is rolled back to; an older one is published again and committed, and its blocks are to be had."""
+    srtc = loop.srtc
+    file = srtc._built["file"]
+    wrong, target, latest = (
+        Belief("learned", system, implicit(system, label="learned", closures="none")[0])
+        for system in (file.system.with_changes({"atmosphere.r0": r0}) for r0 in (0.1, 0.2, 0.3))
+    )
+    assert srtc._learner is not None
+    for belief in (target, wrong):
+        srtc._learner.know(belief)
+    srtc._built["learned"], srtc._auto_commit = latest, True
+    loop.reconstructor, identity = wrong.reconstructor.id, target.reconstructor.id
+    loop.previous = file.reconstructor.id if kept == "another" else identity
+    loop.refuses_to_roll_back = "another swap" in kept
+    until = time.monotonic() + 60
+    while srtc._status is None or srtc._status.previous != loop.previous:
+        assert time.monotonic() < until
+        loop.run(0.1, sensors=None)
+    recent: Any = SimpleNamespace(session=7, first_frame=0, last_frame=9)
+    srtc._act_on(Judgement(recent, wrong, target).ended(Outcome.ROLLED_BACK, "roll back: it is worse"))
+    while loop.reconstructor != identity or srtc._order is not None:
+        assert time.monotonic() < until, (loop.swaps, srtc._order)
+        loop.run(0.1, sensors=None)
+    swaps = {"the target": ["roll_back"], "another": ["commit"]}.get(kept, ["roll_back", "commit"])
+    assert loop.swaps == [(swap, identity) for swap in swaps]
+    assert loop.staged == (identity if "commit" in swaps else 0)
+    request = PublishReconstructor.Request(id=identity, blocks=[0])
+    assert srtc._publish(request, PublishReconstructor.Response()).success
 
 
 def test_what_runs_is_known_after_a_restart(loop: Loop, tmp_path: Path) -> None:
