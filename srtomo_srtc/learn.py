@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -311,24 +312,14 @@ class Solution:
         if flow.shape != (len(self.altitudes), 2):
             raise ValueError(f"velocity: expected shape {(len(self.altitudes), 2)}, got {flow.shape}")
         model, found, altitudes = self.model, self.found, self.altitudes
-        n_layers, n_sensors = len(altitudes), len(model.noise)
-        one_frame = np.asarray(np.linalg.inv(found.information), np.float64)
+        one_frame, told, (groups, reasons) = self._one_frame, self._sums, self._groups
         total = float(found.strengths.sum())
-        groups, reasons = _merge(one_frame[:n_layers, :n_layers])
         fractions = np.array([found.strengths[list(group)].sum() / total for group in groups])
-
-        # what is told, each as a sum of the parameters: log r0, fractions, outer scale, noise levels
-        told = np.zeros((1 + len(groups) + 1 + n_sensors, n_layers + 1 + n_sensors))
-        told[0, :n_layers] = -0.6 / total
-        for row, group, fraction in zip(told[1:], groups, fractions):
-            row[list(group)] = 1 / total
-            row[:n_layers] -= fraction / total
-        told[1 + len(groups) :, n_layers:] = np.eye(1 + n_sensors)
 
         n_effective = self._independent(told @ one_frame, flow)
         sigma = np.sqrt(np.einsum("ij,jk,ik->i", told, one_frame, told) / n_effective)
-        if self.anywhere and n_layers > 1:
-            sigma = np.hypot(sigma, self._between(told))
+        if self.anywhere and len(altitudes) > 1:
+            sigma = np.hypot(sigma, self._between)
         scale, scale_sigma = found.outer_scale**-POWER, float(sigma[1 + len(groups)])
         large, small = scale - scale_sigma, scale + scale_sigma
         altitude = [
@@ -362,6 +353,31 @@ class Solution:
             sampling=model.sampling,
         )
 
+    @cached_property
+    def _one_frame(self) -> Array:
+        """(n_parameters, n_parameters) covariance of the parameters from one frame."""
+        return np.asarray(np.linalg.inv(self.found.information), np.float64)
+
+    @cached_property
+    def _groups(self) -> tuple[list[tuple[int, ...]], list[str]]:
+        """Layers that are told as one, and why."""
+        n_layers = len(self.altitudes)
+        return _merge(self._one_frame[:n_layers, :n_layers])
+
+    @cached_property
+    def _sums(self) -> Array:
+        """(n_told, n_parameters) what is told, each as a sum of these: log r0, fractions, outer scale, noise levels."""
+        groups, n_layers, n_sensors = self._groups[0], len(self.altitudes), len(self.model.noise)
+        strengths = self.found.strengths
+        total = float(strengths.sum())
+        told = np.zeros((1 + len(groups) + 1 + n_sensors, n_layers + 1 + n_sensors))
+        told[0, :n_layers] = -0.6 / total
+        for row, group in zip(told[1:], groups):
+            row[list(group)] = 1 / total
+            row[:n_layers] -= strengths[list(group)].sum() / total**2
+        told[1 + len(groups) :, n_layers:] = np.eye(1 + n_sensors)
+        return told
+
     def _independent(self, influences: Array, velocity: Array) -> Array:
         """(n_told,) independent frames, from a coarse model: only ratios matter."""
         coarse = Sampling.of(self.system, self.layout, self.limit, 2)
@@ -378,16 +394,19 @@ class Solution:
             self.statistics.n_frames,
         )
 
-    def _between(self, told: Array) -> Array:
-        """(n_told,) of turbulence between the grid's altitudes; by few slopes, or by as many as have to be."""
+    @cached_property
+    def _between(self) -> Array:
+        """(n_told,) of turbulence between the grid's altitudes; by few slopes, or by as many as have to be.
+
+        With two node cells a sub-aperture the extrapolated covariance would have negative variances, which no noise
+        covers where stars are bright.
+        """
         try:
-            coarse = Sampling.of(self.system, self.layout, min(_FEW, self.limit // 2), 2)
+            coarse = Sampling.of(self.system, self.layout, min(_FEW, self.limit // 2), 4)
         except ValueError:
-            coarse = Sampling.of(self.system, self.layout, self.limit, 2)
-        found = self.found
-        return spread_between(
-            self.system, self.layout, coarse, self.model.heights, found.strengths, found.outer_scale, found.levels, told
-        )
+            coarse = Sampling.of(self.system, self.layout, self.limit, 4)
+        sky = self.found.strengths, self.found.outer_scale, self.found.levels
+        return spread_between(self.system, self.layout, coarse, self.model.heights, *sky, self._sums)
 
 
 def learn(

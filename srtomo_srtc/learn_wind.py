@@ -4,7 +4,8 @@ Frozen flow says what slopes have in common with slopes a lag t earlier: ``<s[k]
 with B_l(d) the covariance of layer l with itself displaced by d. The velocities that fit the measured matrices best
 are found in least squares, whitened by the slopes' own covariance: from the peak of the correlation with B_l(v t) over
 a grid of velocities, strongest layer first, each found one taken off; then all together by Gauss-Newton over all lags.
-What a coarse grid leaves of strong layers can hide a weak one: each is looked for again in what is left by then.
+What a coarse grid leaves of strong layers can hide a weak one: whichever of them would take most off what is left by
+then, were it elsewhere, goes there.
 """
 
 from __future__ import annotations
@@ -41,8 +42,10 @@ _AGAIN = 3  # times that a layer is looked for elsewhere, at most
 _DAMPED = 1e-3  # of the best seen component's information: a layer that is hardly seen stays where it is
 _CLOSE = 0.02  # m/s: a step this small is the last
 _CURVED = 0.2  # m/s: farther, derivatives are made anew
+_NEAR = 0.05  # m/s: likewise, before the last step
 _STRIDE = 4.0  # m/s: of an iteration, at most
 _FASTEST = 60.0  # m/s
+_OF_GROUP = 0.1  # of the strength of layers that are told as one: without it the rest stands for all
 _LAGS = 100  # in counted frames, about, over which frames that resemble each other are summed
 _RATIO = 1.3  # of those that are looked at
 _FORGOTTEN = 1e-3  # of that sum: what comes after it is left out
@@ -125,17 +128,14 @@ def learn_winds(
 def wind_of_all(layers: Sequence[LayerWind]) -> LayerWind:
     """Of several layers together: their mean by strength, with the largest error that it can have.
 
-    Those that are not seen are left out, unless none is.
+    Not to be trusted if one with a tenth of their strength, or more, is not.
     """
-    seen = [layer for layer in layers if not layer.reason] or list(layers)
-    share = np.array([layer.fraction for layer in seen])
-    share /= share.sum()
-    velocity = share @ np.array([layer.velocity for layer in seen])
-    sigma = share @ np.array([np.sqrt(np.diag(layer.covariance)) for layer in seen])
-    altitude = float(np.average([layer.altitude for layer in layers], weights=[layer.fraction for layer in layers]))
-    total = sum(layer.fraction for layer in layers)
-    covariance = seen[0].covariance if len(seen) == 1 else np.diag(sigma**2)
-    return LayerWind(altitude, total, (float(velocity[0]), float(velocity[1])), covariance, seen[0].reason)
+    fractions = np.array([layer.fraction for layer in layers])
+    share = fractions / fractions.sum()
+    altitude, *velocity = share @ np.array([(layer.altitude, *layer.velocity) for layer in layers])
+    sigma = share @ np.array([np.sqrt(np.diag(layer.covariance)) for layer in layers])
+    reason = next((layer.reason for layer, part in zip(layers, share) if layer.reason and part > _OF_GROUP), "")
+    return LayerWind(altitude, float(fractions.sum()), (velocity[0], velocity[1]), np.diag(sigma**2), reason)
 
 
 def with_winds(system: System, found: Sequence[LayerWind]) -> System:
@@ -194,7 +194,8 @@ class _Flow:
         self._strengths = profile.fractions * profile.r0 ** (-5 / 3)
         self._measured = dict(sorted(measured.items()))
         self._time = list(self._measured)[len(self._measured) // 2]  # the lag that is searched
-        self._grid: dict[int, list[tuple[Array, Array, float]]] = {}  # B_l(v t) and its square, of each layer
+        # of each layer, once it was searched: v, B_l(v t), and its square
+        self._grid: dict[int, list[tuple[Array, NDArray[np.float32], float]]] = {}
         C = model.turbulence(self._strengths, self._outer_scale).astype(np.float64) + sum(model.noise)
         C += model.unseen(C.trace() / len(C))
         self._C = C
@@ -242,10 +243,14 @@ class _Flow:
             # the other half are their opposites: B_l(-d) = B_l(d)^T
             turns = 2 * np.pi * np.arange(_DIRECTIONS // 2) / _DIRECTIONS
             grid = [np.zeros(2), *(v * np.array([np.cos(a), np.sin(a)]) for v in _SPEEDS[1:] for a in turns)]
-            layers = [self._layer(l, velocity, self._time) for velocity in grid]
-            self._grid[l] = [(v, B, float(np.vdot(self._whitened(B), B))) for v, B in zip(grid, layers, strict=True)]
+            self._grid[l] = []
+            for velocity in grid:
+                B = self._layer(l, velocity, self._time)
+                # kept in single precision, in which they are made: there are many
+                self._grid[l].append((velocity, B.astype(np.float32), float(np.vdot(self._whitened(B), B))))
         best, found, taken = -np.inf, np.zeros(2), left
-        for velocity, B, square in self._grid[l]:
+        for velocity, single, square in self._grid[l]:
+            B = single.astype(np.float64)
             for there, correlation in ((velocity, B), (-velocity, B.T)):
                 gain = 2 * float(np.vdot(left, correlation)) - square
                 if gain > best:
@@ -288,9 +293,9 @@ class _Flow:
         blank = [self._C] * velocities.size  # every layer has moved at first
         slopes = {time: _Slope(blank.copy(), blank.copy()) for time in self._measured}
         seen = np.ones(velocities.shape)  # of each component, relative to the best: what is hardly seen decides nothing
-        stride, last = np.full(len(velocities), _STRIDE), np.zeros(velocities.shape)
+        stride, last, curved = np.full(len(velocities), _STRIDE), np.zeros(velocities.shape), _CURVED
         for _ in range(_ITERATIONS):
-            moved = np.flatnonzero((seen * np.abs(velocities - at)).max(axis=1) > _CURVED)
+            moved = np.flatnonzero((seen * np.abs(velocities - at)).max(axis=1) > curved)
             if len(moved):
                 at[moved] = velocities[moved]
                 for time, slope in slopes.items():
@@ -310,14 +315,19 @@ class _Flow:
             length = np.hypot(*step.T)
             # a layer that goes to and fro has gone too far each time
             back = np.sum(step * last, axis=1) < 0
-            stride = np.where(back, np.minimum(stride, length) / 2, np.minimum(1.5 * stride, _STRIDE))
+            shorter = np.maximum(np.minimum(stride, length) / 2, _CURVED)
+            stride = np.where(back, shorter, np.minimum(1.5 * stride, _STRIDE))
             step *= np.minimum(1, stride / np.maximum(length, 1e-9))[:, None]
             last = step
             velocities += step
             speed = np.hypot(*velocities.T)[:, None]
             velocities *= np.minimum(1, _FASTEST / np.maximum(speed, 1e-9))
             if (seen * np.abs(step)).max() < _CLOSE:
-                break
+                if curved < _CURVED:
+                    break
+                curved = _NEAR  # small, but by derivatives of a little elsewhere: once more with new ones
+            else:
+                curved = _CURVED
         return velocities, slopes
 
     def _derivatives(self, l: int, velocity: Array, time: float) -> list[Array]:
@@ -352,7 +362,10 @@ class _Flow:
             share = np.arange(1, last - first + 1) / (last - first)
             part = (1 - share).sum() * parts[-2] + share.sum() * parts[-1]
             spread += part + part.T
-        inverse = np.linalg.pinv(best.information, rcond=1e-9, hermitian=True)
+        # scaled first: only what goes together is left out, not what is hardly seen
+        scale = 1 / np.sqrt(np.diag(best.information))
+        inverse = np.linalg.pinv(best.information * np.outer(scale, scale), rcond=1e-9, hermitian=True)
+        inverse *= np.outer(scale, scale)
         return np.asarray(inverse @ spread @ inverse / pairs)
 
     @staticmethod

@@ -80,15 +80,16 @@ def test_from_pairs_drawn_from_covariances() -> None:
 
 
 @pytest.mark.slow
-def test_a_layer_that_is_hardly_there_says_so() -> None:
+@pytest.mark.parametrize("fraction", [1e-3, 1e-5])
+def test_a_layer_that_is_hardly_there_says_so(fraction: float) -> None:
     layers = [
-        {"altitude": 0.0, "fraction": 0.999, "wind_speed": 7.0, "wind_direction": 0.5},
-        {"altitude": 9000.0, "fraction": 0.001, "wind_speed": 14.0, "wind_direction": -2.0},
+        {"altitude": 0.0, "fraction": 1 - fraction, "wind_speed": 7.0, "wind_direction": 0.5},
+        {"altitude": 9000.0, "fraction": fraction, "wind_speed": 14.0, "wind_direction": -2.0},
     ]
     system = _system(**{"atmosphere.layers": layers})
     strong, weak = learn_winds(_still(system), _drawn(system, 25, 400, 2), limit=LIMIT)
     assert not strong.reason
-    assert "too little of it is seen: 0.1 % of the turbulence" in weak.reason
+    assert f"too little of it is seen: {100 * fraction:.1f} % of the turbulence" in weak.reason
     assert winds(with_winds(_still(system), (strong, weak)))[1] == pytest.approx([0, 0])
 
 

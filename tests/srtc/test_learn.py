@@ -323,6 +323,17 @@ def test_noise_that_is_taken_for_granted_spoils_r0(system: System) -> None:
     )
 
 
+def test_bright_stars_do_not_hinder_the_errors() -> None:
+    # 30 times the light: no noise covers what a coarse stencil takes from the smallest variances
+    file = load_system("gnao_ltao_sr")
+    bright = file.with_changes({f"sensors.{w}.photons": 30 * sensor.photons for w, sensor in enumerate(file.sensors)})
+    altitudes = [layer.altitude for layer in bright.atmosphere.layers]
+    S = covariance(bright, 0.15, 25.0, bright.atmosphere.fractions, [1] * len(bright.sensors), altitudes=altitudes)
+    told = learn(bright, statistics(S, 1000), limit=800)
+    assert told.r0 == pytest.approx(0.15, rel=0.05)
+    assert all(0 < group.sigma < 0.3 for group in told.groups)
+
+
 def test_an_outer_scale_that_is_not_seen_has_no_upper_end(system: System) -> None:
     told = learn(
         system,

@@ -47,9 +47,9 @@ def sent(kind: str, fields: dict[str, Any]) -> Any:
 
 
 def learned(outer_scale_range: tuple[float, float] = (15.0, 28.0)) -> Learned:
-    groups = (Group((0, 1), 500.0, 0.7, 0.02, 50.0, "they correlate"), Group((2,), 9000.0, 0.3, 0.01, 80.0, ""))
+    groups = (Group((0, 1, 2), 500.0, 0.7, 0.02, 50.0, "they correlate"), Group((3,), 9000.0, 0.3, 0.01, 80.0, ""))
     noise = (NoiseLevel(0, 4.0, 0.4), NoiseLevel(2, 1.0, 0.1))
-    altitudes, fractions = np.array([0.0, 1000.0, 9000.0]), np.array([0.5, 0.2, 0.3])
+    altitudes, fractions = np.array([0.0, 500.0, 1000.0, 9000.0]), np.array([0.5, 0.0, 0.2, 0.3])
     values: dict[str, Any] = dict.fromkeys(("measured", "fitted", "sampling"))
     return Learned(
         r0=0.1, r0_sigma=0.002, outer_scale=20.0, outer_scale_range=outer_scale_range, altitudes=altitudes,
@@ -71,11 +71,11 @@ def test_a_learned_sky(mini: System, window: Statistics) -> None:
     # rms over the file's, of the sensors that told
     assert message.noise == pytest.approx([2.0, math.nan, 1.0, math.nan], nan_ok=True)
     assert message.noise_error == pytest.approx([0.1, math.nan, 0.05, math.nan], nan_ok=True)
-    # what is not seen is supposed to be the file's
     # of two that are told as one the mean by strength, whose error is largest where theirs go together
     assert message.wind_speed[0] == pytest.approx(6.0)
     assert message.wind_speed_error[0] == pytest.approx(0.4)
     assert message.wind_direction_error[0] == pytest.approx(0.4 / 6.0)
+    # what is not seen is supposed to be the file's
     assert message.wind_speed[1] > 10 and math.isnan(message.wind_speed_error[1])
 
 
