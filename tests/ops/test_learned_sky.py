@@ -93,8 +93,9 @@ def altitudes(system: System) -> list[float]:
     return [layer.altitude for layer in system.atmosphere.layers]
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
-def test_gnao_in_closed_loop(seed: int) -> None:
+# under the third sky 4 km correlates with what is below by -0.846, where -0.85 would make it one with that
+@pytest.mark.parametrize(("seed", "most"), [(1, 1), (2, 1), (3, 2)])
+def test_gnao_in_closed_loop(seed: int, most: int) -> None:
     file = load_system("gnao_ltao_sr", {"loop.rate": "1 kHz"})
     true = night(file, seed, (0.12, 0.24), (15, 40))
     sky = prepare(true, 18000, seed, science_every=18000)
@@ -121,10 +122,10 @@ def test_gnao_in_closed_loop(seed: int) -> None:
     assert abs(errors[1]) < 0.02
     assert np.all(np.abs(found - wanted) < [0.03, 0.02, 0.015])
     assert np.abs(noise).max() < 0.02
-    # below 4 km, where the stars see little of a split, one is told only as far as it is known
+    # below 4 km no split is told that is beyond what the stars see, and none but as far as it is known
     *low, middle, high = whole.groups
     assert (middle.layers, high.layers) == ((5,), (6,))
-    assert len(low) <= 2
+    assert len(low) <= most
     for group in low:
         print(f"{group.layers}: {group.fraction:.4f} +- {group.sigma:.4f}, {fractions[list(group.layers)].sum():.4f}")
         assert abs(group.fraction - fractions[list(group.layers)].sum()) < 3 * group.sigma

@@ -176,7 +176,9 @@ def print_table(recorded: Recorded, stretches: list[Stretch]) -> None:
 
 @pytest.mark.slow
 @pytest.mark.timeout(1200)
-def test_a_learning_srtc_leaves_the_loop_alone(start_process: Any, tmp_path: Path) -> None:
+def test_a_learning_srtc_leaves_the_loop_alone(
+    start_process: Any, close_on_the_file: Callable[[Operator], None], tmp_path: Path
+) -> None:
     """Windows that are judged as fast as they can be, and a loop that answers as before; all nodes in one session."""
     matrix, report = tmp_path / "G.npz", tmp_path / "recorded.json"
     calibrate(load_system(INSTRUMENT), matrix)
@@ -208,15 +210,7 @@ def test_a_learning_srtc_leaves_the_loop_alone(start_process: Any, tmp_path: Pat
 
     stretches = []
     try:
-        operator.transition("configure")
-        operator.transition("activate")
-        identity, sha256 = operator.publish("file")
-        operator.wait_staged(identity)
-        operator.commit(identity, sha256)
-        operator.close_loop(True)
-        while operator.recorder is None or operator.recorder.slope_publishers == 0:
-            operator.spin(0.1)
-        operator.start_sim()
+        close_on_the_file(operator)
         operator.spin(2.0)
         for _ in range(2):
             stretches.append(measured(operator, ALONE, None))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +30,9 @@ LIMITS = 0.03, 0.03, 0.4
 @pytest.mark.slow
 @pytest.mark.timeout(900)
 @pytest.mark.parametrize("dithered", [False, True])
-def test_what_the_nodes_recorded(start_process: Any, tmp_path: Path, dithered: bool) -> None:
+def test_what_the_nodes_recorded(
+    start_process: Any, close_on_the_file: Callable[[Operator], None], tmp_path: Path, dithered: bool
+) -> None:
     sets = ["--set", f"loop.rate={RATE} Hz"]
     system = load_system("mini", {"loop.rate": f"{RATE} Hz"})
     matrix, bag, places = tmp_path / "G.npz", tmp_path / "bag", tmp_path / "places.json"
@@ -45,15 +48,7 @@ def test_what_the_nodes_recorded(start_process: Any, tmp_path: Path, dithered: b
     rclpy.init()
     operator = Operator(patience=600.0)
     try:
-        operator.transition("configure")
-        operator.transition("activate")
-        identity, sha256 = operator.publish("file")
-        operator.wait_staged(identity)
-        operator.commit(identity, sha256)
-        operator.close_loop(True)
-        while operator.recorder is None or operator.recorder.slope_publishers == 0:
-            operator.spin(0.1)
-        operator.start_sim()
+        close_on_the_file(operator)
         operator.spin(2.0)
         if dithered:
             print("changes of sign:", Dither(system, 5e-9).run(operator, SECONDS))

@@ -217,8 +217,10 @@ def _wfe(run: Run, first: int, last: int) -> float:
 
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
-@pytest.mark.parametrize(("seed", "direction"), [(5, 0.0), (6, 90 * DEGREE), (7, 215 * DEGREE)])
-def test_registration_from_30_s_of_closed_loop(seed: int, direction: float) -> None:
+@pytest.mark.parametrize(
+    ("seed", "direction", "worth"), [(5, 0.0, 1.05), (6, 90 * DEGREE, 1.05), (7, 215 * DEGREE, 1.02)]
+)
+def test_registration_from_30_s_of_closed_loop(seed: int, direction: float, worth: float) -> None:
     # every layer goes the same way at 10 m/s: there the lag looks most like a shift
     system = load_system(
         "gnao_ltao_sr",
@@ -278,5 +280,5 @@ def test_registration_from_30_s_of_closed_loop(seed: int, direction: float) -> N
         )
         after = _wfe(swapped, swap + 100, end)
         print(f"WFE {1e9 * before:.2f} nm before, {1e9 * after:.2f} after the swap, {1e9 * best:.2f} told the truth")
-        assert before > 1.02 * best  # that there is something to win back
+        assert before > worth * best  # there is something to win back
         assert after < 1.02 * best

@@ -126,7 +126,9 @@ def test_the_hrtc_takes_what_is_built_for_wide_stars() -> None:
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
 @pytest.mark.parametrize("changed", [on_faint_stars, on_wide_stars, under_turned_winds])
-def test_it_regains_what_a_change_costs(changed: Callable[[], Case], start_process: Any, tmp_path: Path) -> None:
+def test_it_regains_what_a_change_costs(
+    changed: Callable[[], Case], start_process: Any, close_on_the_file: Callable[[Operator], None], tmp_path: Path
+) -> None:
     """80 % of the difference between never learning and being told, from two windows after the change."""
     case = changed()
     before = load_system("mini", case.settings)
@@ -151,15 +153,7 @@ def test_it_regains_what_a_change_costs(changed: Callable[[], Case], start_proce
     rclpy.init()
     operator = Operator(patience=600.0)
     try:
-        operator.transition("configure")
-        operator.transition("activate")
-        identity, sha256 = operator.publish("file")
-        operator.wait_staged(identity)
-        operator.commit(identity, sha256)
-        operator.close_loop(True)
-        while operator.recorder is None or operator.recorder.slope_publishers == 0:
-            operator.spin(0.1)
-        operator.start_sim()
+        close_on_the_file(operator)
         patience = time.monotonic() + 1200
         while not (tmp_path / "wfe.npz").exists():
             operator.spin(0.5)
